@@ -1,0 +1,26 @@
+# The main job is `make run`; `make test` runs every test. All targets share one virtual environment, ./.venv.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: run test check fast
+.DEFAULT_GOAL := run
+
+$(VENV)/.installed: pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,notebooks]'
+	touch $@
+
+run: $(VENV)/.installed
+	$(BIN)/bayespbrl run gridworld
+
+test: $(VENV)/.installed
+	$(BIN)/python -m pytest -q
+
+fast: $(VENV)/.installed
+	$(BIN)/python -m pytest -q -m "not slow"
+
+check: $(VENV)/.installed
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy

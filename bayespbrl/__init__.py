@@ -1,0 +1,1 @@
+"""Probabilistic programming for preference-based reinforcement learning."""

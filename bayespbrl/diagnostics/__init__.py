@@ -1,0 +1,1 @@
+"""What a researcher puts before a reviewer: convergence, calibration, influence, pictures."""

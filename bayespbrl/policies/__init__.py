@@ -1,0 +1,1 @@
+"""Stochastic policies: tabular, softmax, linear-Gaussian, Gaussian process."""
