@@ -1,0 +1,80 @@
+"""Trajectories τ = (s₀, a₀, s₁, …, s_T): what step 3 produces and what experts compare (paper, MDP\\R)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One trajectory of T steps.
+
+    Attributes:
+      states: s₀ … s_T as observed; shape (T+1, S) float64, or (T+1,) int64 where observations are discrete.
+      actions: a₀ … a_{T−1}; shape (T, A) float64, or (T,) int64 where actions are discrete.
+      rewards: the environment's hidden reward of each step, shape (T,). Only experts and evaluation read it.
+      terminated: whether s_T is terminal (a time limit is not).
+
+    Raises:
+      ValueError: lengths that do not fit together, or an entry that is not finite.
+    """
+
+    states: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminated: bool = False
+
+    def __post_init__(self) -> None:
+        steps = len(self.actions)
+        if len(self.states) != steps + 1 or len(self.rewards) != steps:
+            raise ValueError(
+                f"trajectory: expected T+1 states, T actions and T rewards, got {len(self.states)} states, "
+                f"{steps} actions and {len(self.rewards)} rewards"
+            )
+        for name in ("states", "actions", "rewards"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise ValueError(f"trajectory: {name} must be finite, got NaN or infinity")
+
+    def __len__(self) -> int:
+        """Number of steps T."""
+        return len(self.actions)
+
+    @property
+    def total_reward(self) -> float:
+        """Undiscounted sum of the hidden reward."""
+        return float(np.sum(self.rewards))
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """All steps (sᵢ, aᵢ, sᵢ′) of several trajectories, one row each, in their order.
+
+    Attributes:
+      states, actions, next_states: shapes (N, S), (N, A), (N, S), or (N,) where discrete.
+      rewards: hidden reward, shape (N,).
+      terminal: whether sᵢ′ is terminal, shape (N,) bool.
+    """
+
+    states: np.ndarray
+    actions: np.ndarray
+    next_states: np.ndarray
+    rewards: np.ndarray
+    terminal: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def transitions(trajectories: Sequence[Trajectory]) -> Transitions:
+    """The steps of `trajectories` as one table."""
+    if not trajectories:
+        raise ValueError("transitions: expected at least one trajectory, got none")
+    terminal = [np.arange(len(t)) == (len(t) - 1 if t.terminated else -1) for t in trajectories]
+    return Transitions(
+        states=np.concatenate([t.states[:-1] for t in trajectories]),
+        actions=np.concatenate([t.actions for t in trajectories]),
+        next_states=np.concatenate([t.states[1:] for t in trajectories]),
+        rewards=np.concatenate([t.rewards for t in trajectories]),
+        terminal=np.concatenate(terminal),
+    )
