@@ -1,0 +1,68 @@
+"""Least-squares temporal differences with ℓ2–ℓ2 regularisation (paper, step 2: estimating the Q-function)."""
+
+import numpy as np
+import scipy.linalg
+
+
+def lstd_q(
+    features: np.ndarray,
+    next_features: np.ndarray,
+    utilities: np.ndarray,
+    *,
+    discount: float,
+    fixed_point_ridge: float,
+    projection_ridge: float,
+) -> np.ndarray:
+    """Weights θ of Q(s, a) = φ(s, a)ᵀθ by regularised least-squares temporal differences.
+
+    With G = ΦᵀΦ and P = (G + β₂I)⁻¹ the projection is Σ = PΦᵀ, so that X = Φ − γΦΣΦ′ = ΦM with
+    M = I − γPΦᵀΦ′, and everything follows from two Gram matrices: nothing N × N is formed. Cost O(NQ² + Q³).
+
+    Args:
+      features: φ(sᵢ, aᵢ), shape (N, Q).
+      next_features: φ(sᵢ′, aᵢ′) with aᵢ′ from the current policy; zero where sᵢ′ is terminal. Shape (N, Q).
+      utilities: uᵢ, shape (N,).
+      discount: γ in [0, 1).
+      fixed_point_ridge: β₁ ≥ 0, the penalty on θ.
+      projection_ridge: β₂ ≥ 0, the penalty on the projection. β₁ = β₂ = 0 is ordinary LSTD.
+
+    Returns:
+      θ, shape (Q,).
+
+    Raises:
+      ValueError: shapes that do not fit, a discount outside [0, 1), a negative penalty, an entry that is not finite.
+
+    Source: Hoffman, Lazaric, Ghavamzadeh and Munos (2012), "Regularized least squares temporal difference learning
+    with nested ℓ2 and ℓ1 penalization", the ℓ2–ℓ2 case; paper, step 2.
+    """
+    if features.shape != next_features.shape or utilities.shape != features.shape[:1]:
+        raise ValueError(
+            "lstd_q: expected features and next_features (N, Q) and utilities (N,), got "
+            f"{features.shape}, {next_features.shape} and {utilities.shape}"
+        )
+    if not 0 <= discount < 1:
+        raise ValueError(f"discount: expected a number in [0, 1), got {discount}")
+    if fixed_point_ridge < 0 or projection_ridge < 0:
+        raise ValueError(f"ridge: expected penalties >= 0, got {fixed_point_ridge} and {projection_ridge}")
+    size = features.shape[1]
+    gram = features.T @ features
+    cross = features.T @ next_features
+    target = features.T @ utilities
+    if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross)) and np.all(np.isfinite(target))):
+        raise ValueError("lstd_q: features and utilities must be finite, got NaN or infinity")
+    projected = _solve_symmetric(gram, projection_ridge, np.column_stack([cross, target]))
+    mixing = np.eye(size) - discount * projected[:, :size]  # M: X = ΦM
+    normal = mixing.T @ gram @ mixing  # XᵀX
+    return _solve_symmetric(normal, fixed_point_ridge, mixing.T @ (gram @ projected[:, size]))
+
+
+def _solve_symmetric(matrix: np.ndarray, ridge: float, right: np.ndarray) -> np.ndarray:
+    """Solve (matrix + ridge·I) x = right for a positive semi-definite matrix; least norm where it is singular."""
+    ridged = matrix + ridge * np.eye(len(matrix))
+    try:
+        return scipy.linalg.cho_solve(scipy.linalg.cho_factor(ridged, check_finite=False), right, check_finite=False)
+    except np.linalg.LinAlgError:
+        # features that never occurred leave zero rows, and rounding can make a tiny eigenvalue negative
+        values, vectors = np.linalg.eigh(ridged)
+        keep = values > 1e-12 * max(values[-1], np.finfo(float).tiny)
+        return vectors[:, keep] @ ((vectors[:, keep].T @ right) / values[keep].reshape(-1, *[1] * (right.ndim - 1)))

@@ -1,0 +1,157 @@
+"""Actor-critic REPS: sample weights that raise Q within a KL bound (paper, step 2, eqs. 11-13)."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
+
+
+@dataclass(frozen=True)
+class RepsSolution:
+    """Solution of the REPS dual and how well it meets its two conditions.
+
+    Attributes:
+      sample_weights: wᵢ = pᵢ/Wᵢ for the weighted fit of eq. 14, mean 1 under W, shape (N,).
+      probabilities: pᵢ of eq. 12, shape (N,), sum 1.
+      value_weights: v with V(s) = vᵀφ(s), in the units of Q, shape (D,).
+      temperature: η in the units of Q.
+      kl: KL(p‖W) in nats.
+      kl_bound: ε that was asked for, in nats.
+      bound_active: whether the bound holds with equality; where it does not, no admissible p is that far from W.
+      feature_gap: largest |Σ pᵢφᵢ − φ̂| in the whitened features.
+      feature_gap_raw: the same in the features as given, the dropped directions among them.
+      rank_kept: number of whitened directions.
+      effective_samples: Kish's 1/Σ pᵢ².
+      converged: whether the solver met its tolerance.
+      status: the solver's own word.
+    """
+
+    sample_weights: np.ndarray
+    probabilities: np.ndarray
+    value_weights: np.ndarray
+    temperature: float
+    kl: float
+    kl_bound: float
+    bound_active: bool
+    feature_gap: float
+    feature_gap_raw: float
+    rank_kept: int
+    effective_samples: float
+    converged: bool
+    status: str
+
+
+def reps_weights(
+    q_values: np.ndarray,
+    state_features: np.ndarray,
+    base_weights: np.ndarray,
+    *,
+    kl_bound: float,
+    rank_tolerance: float = 1e-3,
+) -> RepsSolution:
+    """Maximise Σ pᵢQᵢ subject to KL(p‖W) ≤ ε and Σ pᵢφᵢ = φ̂ by the dual of eq. 13.
+
+    The dual in raw radial basis features is hopelessly ill-conditioned, so the features are centred and whitened,
+    directions below `rank_tolerance` of the largest singular value dropped, and Q standardised; then CasADi's IPOPT
+    with limited-memory Hessian needs some twenty iterations.
+
+    Args:
+      q_values: Qᵢ, shape (N,).
+      state_features: φ(sᵢ), shape (N, D).
+      base_weights: Wᵢ > 0 with sum 1, shape (N,): 1/N for fresh samples of the policy, q(a|s) × visits for all actions
+        of each visited state.
+      kl_bound: ε > 0, nats.
+      rank_tolerance: relative singular value below which a direction of the features is left unconstrained.
+
+    Raises:
+      ValueError: shapes that do not fit, a bound that is not positive and finite, entries that are not finite.
+
+    Source: paper, eqs. 11-13; Daniel, Neumann and Peters (2012) for the feature constraint.
+    """
+    _check(q_values, state_features, base_weights, kl_bound)
+    whitened, unwhiten = _whiten(state_features, base_weights, rank_tolerance)
+    mean = base_weights @ q_values
+    spread = np.sqrt(base_weights @ (q_values - mean) ** 2)
+    scale = spread if spread > 1e-12 * max(1.0, np.abs(mean)) else 1.0
+    standardised = (q_values - mean) / scale
+    temperature, dual, converged, status = _solve_dual(standardised, whitened, base_weights, kl_bound)
+    logits = np.log(base_weights) + (standardised - whitened @ dual) / temperature  # (eq. 12)
+    probabilities = np.exp(logits - np.max(logits))
+    probabilities /= np.sum(probabilities)
+    ratio = probabilities / base_weights
+    positive = probabilities > 0
+    kl = float(probabilities[positive] @ np.log(ratio[positive]))
+    return RepsSolution(
+        sample_weights=ratio,  # mean Σ W·p/W = 1 by construction
+        probabilities=probabilities,
+        value_weights=scale * (unwhiten @ dual),
+        temperature=scale * temperature,
+        kl=kl,
+        kl_bound=kl_bound,
+        bound_active=bool(abs(kl - kl_bound) <= 0.01 * kl_bound),
+        feature_gap=float(np.max(np.abs(probabilities @ whitened), initial=0.0)),
+        feature_gap_raw=float(np.max(np.abs((probabilities - base_weights) @ state_features), initial=0.0)),
+        rank_kept=whitened.shape[1],
+        effective_samples=float(1 / np.sum(probabilities**2)),
+        converged=converged,
+        status=status,
+    )
+
+
+def _check(q_values: np.ndarray, state_features: np.ndarray, base_weights: np.ndarray, kl_bound: float) -> None:
+    size = len(q_values)
+    if q_values.shape != (size,) or base_weights.shape != (size,) or state_features.shape[:1] != (size,):
+        raise ValueError(
+            "reps_weights: expected q_values (N,), state_features (N, D) and base_weights (N,), got "
+            f"{q_values.shape}, {state_features.shape} and {base_weights.shape}"
+        )
+    if not (np.isfinite(kl_bound) and kl_bound > 0):
+        raise ValueError(f"kl_bound: expected a positive finite number, got {kl_bound}")
+    for name, array in (("q_values", q_values), ("state_features", state_features), ("base_weights", base_weights)):
+        if not np.all(np.isfinite(array)):
+            raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
+    if np.any(base_weights <= 0) or abs(np.sum(base_weights) - 1) > 1e-6:
+        raise ValueError(f"base_weights: expected positive entries with sum 1, got sum {np.sum(base_weights)}")
+
+
+def _whiten(features: np.ndarray, base_weights: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centred features of unit variance under W, (N, r), and the (D, r) matrix that maps to them."""
+    centred = features - base_weights @ features
+    covariance = centred.T @ (centred * base_weights[:, None])
+    values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
+    keep = values > max(values[-1], 0.0) * tolerance**2
+    if not np.any(keep) or values[-1] <= 1e-24:
+        return np.zeros((len(features), 0)), np.zeros((features.shape[1], 0))
+    mapping = vectors[:, keep] / np.sqrt(values[keep])
+    return centred @ mapping, mapping
+
+
+def _solve_dual(
+    q_values: np.ndarray, features: np.ndarray, base_weights: np.ndarray, kl_bound: float
+) -> tuple[float, np.ndarray, bool, str]:
+    """Minimise g(η, v) = ηε + η log Σ Wᵢ exp((Qᵢ − vᵀφᵢ)/η) (eq. 13 with φ̂ = 0) over η ≥ floor and v."""
+    rank = features.shape[1]
+    unknown = ca.MX.sym("eta_and_v", 1 + rank)
+    eta = unknown[0]
+    advantage = ca.DM(q_values)
+    if rank:
+        advantage = advantage - ca.mtimes(ca.DM(features), unknown[1:])
+    logits = ca.DM(np.log(base_weights)) + advantage / eta
+    dual = eta * kl_bound + eta * ca.logsumexp(logits)
+    options = {
+        "print_time": False,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.hessian_approximation": "limited-memory",
+        "ipopt.limited_memory_max_history": 20,
+        "ipopt.tol": 1e-8,
+        "ipopt.max_iter": 500,
+    }
+    solver = ca.nlpsol("reps_dual", "ipopt", {"x": unknown, "f": dual}, options)
+    lower = np.concatenate([[TEMPERATURE_FLOOR], np.full(rank, -np.inf)])
+    start = np.concatenate([[1.0], np.zeros(rank)])
+    solution = np.asarray(solver(x0=start, lbx=lower, ubx=np.inf)["x"]).ravel()
+    statistics = solver.stats()
+    return float(solution[0]), solution[1:], bool(statistics["success"]), str(statistics["return_status"])

@@ -1,0 +1,72 @@
+import numpy as np
+import pytest
+
+from bayespbrl.lstd import lstd_q
+
+NO_PENALTY = {"fixed_point_ridge": 0.0, "projection_ridge": 0.0}
+
+
+def chain_features(length):
+    """A chain 0 → 1 → … → length − 1, whose last state loops; one-hot features."""
+    states = np.arange(length)
+    return np.eye(length)[states], np.eye(length)[np.minimum(states + 1, length - 1)]
+
+
+def test_lstd_on_a_chain_solves_the_bellman_equation():
+    features, following = chain_features(6)
+    rewards = np.array([0.5, -1.0, 2.0, 0.0, 3.0, 1.0])
+    expected = np.linalg.solve(np.eye(6) - 0.9 * following, rewards)  # (I − γP)⁻¹ r
+    np.testing.assert_allclose(lstd_q(features, following, rewards, discount=0.9, **NO_PENALTY), expected, atol=1e-9)
+
+
+def test_a_terminal_successor_is_worth_nothing():
+    features = np.eye(2)
+    following = np.array([[0.0, 1.0], [0.0, 0.0]])
+    weights = lstd_q(features, following, np.array([1.0, 4.0]), discount=0.5, **NO_PENALTY)
+    np.testing.assert_allclose(weights, [3.0, 4.0])
+
+
+def test_discount_zero_is_ridge_regression_on_the_projected_target():
+    rng = np.random.default_rng(3)
+    features, utilities = rng.normal(size=(40, 5)), rng.normal(size=40)
+    following = rng.normal(size=(40, 5))
+    gram = features.T @ features
+    projected = features @ np.linalg.solve(gram + 0.7 * np.eye(5), features.T @ utilities)
+    expected = np.linalg.solve(gram + 0.3 * np.eye(5), features.T @ projected)
+    weights = lstd_q(features, following, utilities, discount=0.0, fixed_point_ridge=0.3, projection_ridge=0.7)
+    np.testing.assert_allclose(weights, expected, atol=1e-12)
+
+
+def test_penalised_weights_equal_the_formula_with_the_projection_written_out():
+    rng = np.random.default_rng(4)
+    features, following = rng.normal(size=(30, 4)), rng.normal(size=(30, 4))
+    utilities = rng.normal(size=30)
+    projection = np.linalg.solve(features.T @ features + 0.2 * np.eye(4), features.T)  # Σ, (4, 30)
+    design = features - 0.8 * features @ projection @ following
+    target = features @ projection @ utilities
+    expected = np.linalg.solve(design.T @ design + 0.1 * np.eye(4), design.T @ target)
+    weights = lstd_q(features, following, utilities, discount=0.8, fixed_point_ridge=0.1, projection_ridge=0.2)
+    np.testing.assert_allclose(weights, expected, atol=1e-10)
+
+
+def test_features_that_never_occur_get_weight_zero():
+    features, following = chain_features(3)
+    padded = [np.column_stack([block, np.zeros(3)]) for block in (features, following)]
+    weights = lstd_q(*padded, np.ones(3), discount=0.5, **NO_PENALTY)
+    np.testing.assert_allclose(weights, [2.0, 2.0, 2.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"discount": 1.0}, "discount"),
+        ({"projection_ridge": -1.0}, "ridge"),
+        ({"utilities": np.ones(4)}, "utilities"),
+        ({"utilities": np.array([1.0, np.nan, 0.0])}, "finite"),
+    ],
+)
+def test_bad_input_is_named(changes, message):
+    features, following = chain_features(3)
+    arguments = {"utilities": np.ones(3), "discount": 0.5, **NO_PENALTY} | changes
+    with pytest.raises(ValueError, match=message):
+        lstd_q(features, following, **arguments)
