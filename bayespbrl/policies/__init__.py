@@ -1,1 +1,7 @@
 """Stochastic policies: tabular, softmax, linear-Gaussian, Gaussian process."""
+
+from bayespbrl.policies.batch import entropies, log_probabilities, sample_actions
+from bayespbrl.policies.policy import Policy
+from bayespbrl.policies.tabular import TabularPolicy
+
+__all__ = ["Policy", "TabularPolicy", "entropies", "log_probabilities", "sample_actions"]
