@@ -1,0 +1,112 @@
+"""Pure environment functions as a gymnasium environment (step 3 of the cycle needs both views of one dynamics).
+
+`reset` and `step` fix how one key is shared among the functions of a `FuncEnv`; the gymnasium class below and the
+compiled rollouts both go through them, so that the two views cannot drift apart.
+"""
+
+from functools import partial
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.experimental.functional import FuncEnv
+
+
+def reset(dynamics: FuncEnv, key: jax.Array) -> tuple[Any, Any]:
+    """Start an episode: `(state, observation)`. Traceable; follows its caller's dtype."""
+    initial_key, observation_key = jax.random.split(key)
+    state = dynamics.initial(initial_key)
+    return state, dynamics.observation(state, observation_key)
+
+
+def step(dynamics: FuncEnv, key: jax.Array, state: Any, action: Any) -> tuple[Any, Any, Any, Any]:
+    """One step: `(next_state, observation, reward, terminated)`. Traceable; follows its caller's dtype.
+
+    The action is passed on as it comes: clipping to the action space is the caller's or the dynamics' affair.
+    """
+    transition_key, observation_key, reward_key, terminal_key = jax.random.split(key, 4)
+    next_state = dynamics.transition(state, action, transition_key)
+    observation = dynamics.observation(next_state, observation_key)
+    reward = dynamics.reward(state, action, next_state, reward_key)
+    return next_state, observation, reward, dynamics.terminal(next_state, terminal_key)
+
+
+# One compilation for all environments over the same dynamics object (hashed by identity).
+_reset = jax.jit(reset, static_argnums=0)
+_step = jax.jit(step, static_argnums=0)
+
+
+class FunctionalEnv(gymnasium.Env):
+    """A gymnasium environment over the pure functions of `dynamics`, in float64.
+
+    The dynamics may offer `draw(observation, axes)`, which draws one observation on matplotlib axes; then
+    `render_mode="rgb_array"` is available. It must not be changed after its first use, because it is compiled in.
+
+    Attributes:
+      dynamics: the `FuncEnv`.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's interface)
+
+    def __init__(self, dynamics: FuncEnv, render_mode: str | None = None):
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}")
+        if render_mode is not None and not hasattr(dynamics, "draw"):
+            raise ValueError(
+                f"render_mode: {type(dynamics).__name__} has no method draw(observation, axes), got rgb_array"
+            )
+        self.dynamics = dynamics
+        self.observation_space = dynamics.observation_space
+        self.action_space = dynamics.action_space
+        self.render_mode = render_mode
+        self._key: jax.Array | None = None
+        self._state: Any = None
+        self._observed: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; its JAX key is drawn from the environment's seeded NumPy generator."""
+        super().reset(seed=seed)
+        episode_key = jax.random.key(int(self.np_random.integers(2**31)))
+        self._key, initial_key = jax.random.split(episode_key)
+        with jax.enable_x64(True):
+            self._state, observation = _reset(self.dynamics, initial_key)
+        return self._observation(observation), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One step; `truncated` is always False here, the time limit being gymnasium's `TimeLimit` wrapper's."""
+        if self._key is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        self._key, step_key = jax.random.split(self._key)
+        with jax.enable_x64(True):
+            action = np.asarray(action, dtype=self.action_space.dtype)
+            self._state, observation, reward, terminated = _step(self.dynamics, step_key, self._state, action)
+        return self._observation(observation), float(reward), bool(terminated), False, {}
+
+    def _observation(self, observation: Any) -> Any:
+        if isinstance(self.observation_space, gymnasium.spaces.Discrete):
+            self._observed = np.int64(observation)
+            return self._observed
+        self._observed = np.array(observation, dtype=self.observation_space.dtype)
+        return self._observed.copy()
+
+    def render(self) -> Any:
+        """The current observation as an RGB picture, shape (height, width, 3) uint8; None without a render mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() without a render mode: make the environment with render_mode='rgb_array'")
+            return None
+        if self._key is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        return picture(partial(self.dynamics.draw, self._observed))  # type: ignore[attr-defined]
+
+
+def picture(draw: Any, *, inches: tuple[float, float] = (4.0, 4.0), dots_per_inch: int = 80) -> np.ndarray:
+    """What `draw(axes)` draws, as an array of shape (height, width, 3) uint8, without matplotlib's global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=inches, dpi=dots_per_inch, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    draw(figure.add_subplot())
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
