@@ -21,8 +21,9 @@ def dimension(name: str, space: Space) -> int:
 
 def centre_and_range(name: str, space: Space) -> tuple[np.ndarray, np.ndarray]:
     """(low + high)/2 and high − low of a `Box`, per dimension; 0 and 2, as of [−1, 1], where a bound is infinite."""
-    dimension(name, space)
-    low, high = np.asarray(space.low, float), np.asarray(space.high, float)  # type: ignore[attr-defined]
+    if not isinstance(space, Box):
+        raise ValueError(f"{name}: expected a Box, got {space}")
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     bounded = np.isfinite(low) & np.isfinite(high)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
     if not np.all(high > low):
