@@ -1,0 +1,106 @@
+"""Any gymnasium environment, made ready for the learner: opened by name, its spaces checked and flattened."""
+
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.experimental.functional import FuncEnv
+from gymnasium.spaces import Box, Discrete
+from gymnasium.wrappers import TransformAction, TransformObservation
+
+from bayespbrl.envs import SHORT_NAMES
+from bayespbrl.envs.functional import FunctionalEnv
+
+# Environments that we made from an id, and that can therefore be made again, N at a time.
+_MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
+
+
+def open_environment(environment: str | EnvSpec | gymnasium.Env | FuncEnv) -> gymnasium.Env:
+    """The environment behind a short name, a gymnasium id or spec, an environment object or pure functions.
+
+    The result has 1-D `Box` spaces or `Discrete` spaces counted from 0 (**decision**: other shapes are flattened, other
+    starts are shifted, by wrappers that undo it on the way in), so that policies and features meet nothing else.
+    Opening what is already open gives the same object back.
+
+    Raises:
+      ValueError: unknown name; an environment that cannot be made; a space that is neither `Box` nor `Discrete`.
+    """
+    if isinstance(environment, str | EnvSpec):
+        opened = flattened(_make(environment))
+        _MADE_FROM[opened] = _spec(environment)
+        return opened
+    if isinstance(environment, FuncEnv):
+        return flattened(FunctionalEnv(environment))
+    if isinstance(environment, gymnasium.Env):
+        return flattened(environment)
+    raise ValueError(
+        f"environment: expected a short name ({', '.join(SHORT_NAMES)}), a gymnasium id or spec, a gymnasium.Env or a "
+        f"FuncEnv, got {type(environment).__name__}"
+    )
+
+
+def made_from(env: gymnasium.Env) -> EnvSpec | None:
+    """The spec from which `open_environment` made `env`; None for an object of the user's: there is only one of it."""
+    return _MADE_FROM.get(env)
+
+
+def environment_name(env: gymnasium.Env) -> str:
+    """What to call the environment in a message: its id, else its class."""
+    if env.spec is not None:
+        return env.spec.id
+    inner = env.unwrapped
+    return type(inner.dynamics if isinstance(inner, FunctionalEnv) else inner).__name__
+
+
+def _spec(environment: str | EnvSpec) -> EnvSpec:
+    if isinstance(environment, EnvSpec):
+        return environment
+    return gymnasium.spec(SHORT_NAMES.get(environment, environment))
+
+
+def _make(environment: str | EnvSpec) -> gymnasium.Env:
+    try:
+        return gymnasium.make(_spec(environment))
+    except (gymnasium.error.UnregisteredEnv, gymnasium.error.DeprecatedEnv, ModuleNotFoundError) as error:
+        raise ValueError(
+            f"environment: expected {', '.join(SHORT_NAMES)} or a registered gymnasium id, got {environment!r} "
+            f"({' '.join(str(error).split())})"
+        ) from error
+    except Exception as error:
+        raise ValueError(f"environment {environment!r} cannot be made: {' '.join(str(error).split())}") from error
+
+
+def flattened(env: gymnasium.Env) -> gymnasium.Env:
+    """`env` with 1-D `Box` spaces and `Discrete` spaces counted from 0; `env` itself where nothing is to be done."""
+    observations, actions = env.observation_space, env.action_space
+    for kind, space in (("observation", observations), ("action", actions)):
+        if not isinstance(space, Box | Discrete) or (
+            kind == "action" and isinstance(space, Box) and not np.issubdtype(space.dtype, np.floating)
+        ):
+            raise ValueError(
+                f"environment {environment_name(env)}: expected a Discrete or {'real ' if kind == 'action' else ''}Box "
+                f"{kind} space, got {space}"
+            )
+    if (plain := _plain_space(observations)) is not observations:
+        env = TransformObservation(env, lambda value: _to_plain(observations, value), plain)
+    if (plain := _plain_space(actions)) is not actions:
+        env = TransformAction(env, lambda value: _from_plain(actions, value), plain)
+    return env
+
+
+def _plain_space(space: Any) -> Any:
+    if isinstance(space, Box):
+        if len(space.shape) == 1:
+            return space
+        return Box(space.low.reshape(-1), space.high.reshape(-1), dtype=space.dtype.type)
+    return space if space.start == 0 else Discrete(int(space.n))
+
+
+def _to_plain(space: Any, value: Any) -> Any:
+    return np.reshape(value, -1) if isinstance(space, Box) else np.int64(value - space.start)
+
+
+def _from_plain(space: Any, value: Any) -> Any:
+    return np.reshape(value, space.shape) if isinstance(space, Box) else np.int64(value + space.start)

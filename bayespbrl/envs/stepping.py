@@ -1,0 +1,129 @@
+"""Episodes through the ordinary gymnasium interface, for environments that offer no pure functions."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+from bayespbrl.envs.opening import environment_name, flattened, made_from
+
+MAX_LANES = 128  # copies of an environment stepped side by side
+Episode = tuple[np.ndarray, np.ndarray, np.ndarray, bool]
+
+
+def episodes_by_interface(
+    env: gymnasium.Env,
+    act: Callable[[int, np.ndarray], np.ndarray],
+    *,
+    seed: int,
+    episodes: int,
+    steps: int,
+    time_limit: int | None = None,
+) -> Iterator[Episode]:
+    """`(states, actions, rewards, terminated)` of each episode, the arrays as in a trajectory.
+
+    Args:
+      env: from `open_environment`. If that made it from an id, copies run side by side; else the object itself, one
+        episode after the other.
+      act: `act(counter, observations) -> actions` for a batch; the counter never repeats.
+      seed: of the first reset; the others count up from it.
+      steps: cap on the length of an episode.
+      time_limit: replaces the environment's own limit where copies are made.
+
+    Raises:
+      ValueError: the environment raised, or returned a number that is not finite; names it and the step.
+    """
+    lanes = min(episodes, MAX_LANES) if made_from(env) is not None else 1
+    vector = _copies(env, lanes, time_limit)
+    name = environment_name(env)
+    try:
+        for first in range(0, episodes, lanes):
+            batch = _batch(vector, name, lambda t, seen, first=first: act(first * steps + t, seen), seed + first, steps)
+            yield from batch[: episodes - first]
+    finally:
+        vector.close()
+
+
+class _Borrowed(gymnasium.Wrapper):
+    """The user's own environment: ours to step, not ours to close."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+
+def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None) -> VectorEnv:
+    spec = made_from(env)
+    if spec is None:
+        return SyncVectorEnv([lambda: _Borrowed(env)])
+    options: dict[str, Any] = {} if time_limit is None else {"max_episode_steps": time_limit}
+    if spec.vector_entry_point is not None and not options and flattened(env.unwrapped) is env.unwrapped:
+        vector = gymnasium.make_vec(spec, num_envs=lanes)
+        # In the other modes the last observation of an episode is hidden, or a reset is due that not all of them allow.
+        if vector.metadata.get("autoreset_mode") == AutoresetMode.NEXT_STEP:
+            return vector
+        vector.close()
+    wrappers: list[Any] = [flattened]
+    return gymnasium.make_vec(spec, num_envs=lanes, vectorization_mode="sync", wrappers=wrappers, **options)
+
+
+def _batch(vector: VectorEnv, name: str, act: Any, seed: int, steps: int) -> list[Episode]:
+    """One episode a lane. A lane that has ended is stepped on with the others (it resets itself), and ignored."""
+    lanes = vector.num_envs
+    with _blaming(name, "its reset"):
+        observations, _ = vector.reset(seed=seed)
+    alive, ended, lengths = np.ones(lanes, bool), np.zeros(lanes, bool), np.zeros(lanes, int)
+    states, actions, rewards = [_checked(name, "its reset", _wide(observations))], [], []
+    t = 0
+    while t < steps and alive.any():
+        actions.append(_within(vector.single_action_space, act(t, states[-1])))
+        t += 1
+        with _blaming(name, f"step {t}"):
+            observations, reward, terminated, truncated, _ = vector.step(actions[-1])
+        _checked(name, f"step {t}", _wide(observations)[alive], np.asarray(reward)[alive])
+        # what idle lanes return must not reach the policy as NaN
+        states.append(np.nan_to_num(_wide(observations)))
+        rewards.append(np.asarray(reward, float))
+        lengths += alive
+        ended |= alive & terminated
+        alive &= ~(terminated | truncated)
+    table = np.stack(states), _wide(np.stack(actions)), np.stack(rewards)
+    return [
+        (table[0][: n + 1, i].copy(), table[1][:n, i].copy(), table[2][:n, i].copy(), bool(ended[i]))
+        for i, n in enumerate(lengths)
+    ]
+
+
+def _wide(values: np.ndarray) -> np.ndarray:
+    # Discrete spaces batch to (lanes,) integers, 1-D boxes to (lanes, S) of any number type
+    values = np.asarray(values)
+    return (
+        values.astype(np.int64)
+        if values.ndim == 1 and np.issubdtype(values.dtype, np.integer)
+        else values.astype(float)
+    )
+
+
+def _within(space: Any, actions: np.ndarray) -> np.ndarray:
+    if isinstance(space, Box):
+        return np.clip(actions.reshape(len(actions), -1), space.low, space.high).astype(space.dtype)
+    return np.asarray(actions).astype(np.int64)
+
+
+def _checked(name: str, where: str, *values: np.ndarray) -> np.ndarray:
+    if not all(np.isfinite(value).all() for value in values):
+        raise ValueError(
+            f"environment {name}: expected finite observations and rewards, got NaN or infinity at {where}"
+        )
+    return values[0]
+
+
+@contextmanager
+def _blaming(name: str, where: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        raise ValueError(f"environment {name} failed at {where}: {type(error).__name__}: {error}") from error

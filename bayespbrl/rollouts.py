@@ -1,0 +1,267 @@
+"""Step 3: policy × environment → trajectories (paper, figure 1), compiled where the environment is pure functions.
+
+An environment with pure functions (`env.unwrapped.dynamics`) and a policy that is a JAX pytree run as one compiled
+`lax.scan` over all episodes at once. Anything else is stepped through the ordinary gymnasium interface: as a vector
+environment if it was opened by its id (the environment's own one where it offers one), else episode by episode.
+
+Continuous actions are clipped to the action space, and the clipped action is the one stored.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.experimental.functional import FuncEnv
+from gymnasium.spaces import Box
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+
+from bayespbrl.envs import functional
+from bayespbrl.envs.opening import environment_name, open_environment
+from bayespbrl.envs.stepping import episodes_by_interface
+from bayespbrl.trajectories import Trajectory
+
+__all__ = ["Returns", "compilations", "open_environment", "returns", "rollout", "step_limit"]
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Evaluation of a policy, one entry an episode.
+
+    Attributes:
+      total: undiscounted sum of the environment's reward, shape (episodes,).
+      steps: length of the episode, shape (episodes,) int64.
+      terminated: whether it ended in a terminal state (not at the time limit), shape (episodes,) bool.
+    """
+
+    total: np.ndarray
+    steps: np.ndarray
+    terminated: np.ndarray
+
+
+def rollout(
+    environment: Any, policy: Any, *, key: jax.Array, episodes: int, max_steps: int | None = None
+) -> tuple[Trajectory, ...]:
+    """Trajectories of `episodes` episodes under `policy.sample`.
+
+    Args:
+      environment: anything `open_environment` takes.
+      policy: has `sample(key, observation) -> action`, JAX-traceable if the policy is a pytree of arrays.
+      key: JAX random key; it decides everything, resets included.
+      episodes: number of episodes, ≥ 1.
+      max_steps: time limit; by default the environment's own.
+
+    Raises:
+      ValueError: bad arguments; no time limit known; an environment that raises or returns NaN, named with the step.
+    """
+    env = open_environment(environment)
+    steps = _checked(env, policy, key, episodes, max_steps)
+    dynamics = _pure_dynamics(env, policy)
+    if dynamics is None:
+        return tuple(_by_interface(env, policy, key, episodes, steps, max_steps is not None))
+    with jax.enable_x64(True):
+        run = _simulate(dynamics, policy, key, episodes=episodes, steps=steps)
+        observations, actions, rewards, terminated, lengths = (np.asarray(part) for part in run)
+    trajectories = []
+    for states, acts, signal, ended, length in zip(observations, actions, rewards, terminated, lengths, strict=True):
+        _require_finite(env, states[: length + 1], signal[:length])
+        trajectories.append(Trajectory(states[: length + 1], acts[:length], signal[:length], bool(ended)))
+    return tuple(trajectories)
+
+
+def returns(environment: Any, policy: Any, *, key: jax.Array, episodes: int, max_steps: int | None = None) -> Returns:
+    """Undiscounted returns of the same episodes as `rollout` with the same arguments, without keeping them.
+
+    Raises:
+      ValueError: as `rollout`.
+    """
+    env = open_environment(environment)
+    limit = _checked(env, policy, key, episodes, max_steps)
+    dynamics = _pure_dynamics(env, policy)
+    if dynamics is None:
+        run = _by_interface(env, policy, key, episodes, limit, max_steps is not None)
+        rows = [(trajectory.total_reward, len(trajectory), trajectory.terminated) for trajectory in run]
+        total, steps, terminated = (np.array(column) for column in zip(*rows, strict=True))
+        return Returns(total, steps, terminated)
+    with jax.enable_x64(True):
+        total, steps, terminated, finite = (
+            np.asarray(part) for part in _evaluate(dynamics, policy, key, limit, episodes=episodes)
+        )
+    if not finite.all():
+        raise ValueError(_not_finite(env, int(steps[~finite].min())))
+    return Returns(total, steps, terminated)
+
+
+def step_limit(environment: Any, max_steps: int | None = None) -> int:
+    """The time limit that holds: `max_steps`, else the `TimeLimit` wrapper's, else the spec's, else the dynamics'."""
+    env = open_environment(environment)
+    if max_steps is not None:
+        if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
+            raise ValueError(f"max_steps: expected an integer ≥ 1, got {max_steps!r}")
+        return int(max_steps)
+    limits: list[Any] = [layer._max_episode_steps for layer in _layers(env) if isinstance(layer, TimeLimit)]
+    limits.append(env.spec.max_episode_steps if env.spec is not None else None)
+    limits.append(getattr(getattr(env.unwrapped, "dynamics", None), "max_episode_steps", None))
+    for limit in limits:
+        if limit is not None:
+            return int(limit)
+    raise ValueError(f"environment {environment_name(env)} states no time limit: expected max_steps, got None")
+
+
+def compilations() -> int:
+    """How many programs this module has compiled so far in this process; must not grow with the iterations."""
+    compiled: tuple[Any, ...] = (_simulate, _evaluate, _act)
+    return sum(function._cache_size() for function in compiled)
+
+
+def _checked(env: gymnasium.Env, policy: Any, key: Any, episodes: Any, max_steps: int | None) -> int:
+    if not callable(getattr(policy, "sample", None)):
+        raise ValueError(f"policy: expected an object with sample(key, observation), got {type(policy).__name__}")
+    if not isinstance(key, jax.Array):
+        raise ValueError(f"key: expected a JAX random key, got {type(key).__name__}")
+    if isinstance(episodes, bool) or not isinstance(episodes, int | np.integer) or episodes < 1:
+        raise ValueError(f"episodes: expected an integer ≥ 1, got {episodes!r}")
+    return step_limit(env, max_steps)
+
+
+def _layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
+    while isinstance(env, gymnasium.Wrapper):
+        yield env
+        env = env.env
+    yield env
+
+
+def _pure_dynamics(env: gymnasium.Env, policy: Any) -> FuncEnv | None:
+    """The pure functions, if nothing between them and the caller changes what they mean (a user's wrapper might)."""
+    *wrappers, inner = _layers(env)
+    dynamics = getattr(inner, "dynamics", None)
+    harmless = all(isinstance(layer, TimeLimit | OrderEnforcing | PassiveEnvChecker) for layer in wrappers)
+    return dynamics if isinstance(dynamics, FuncEnv) and harmless and _is_pytree(policy) else None
+
+
+def _is_pytree(policy: Any) -> bool:
+    return all(isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int) for leaf in jax.tree.leaves(policy))
+
+
+def _require_finite(env: gymnasium.Env, states: np.ndarray, rewards: np.ndarray) -> None:
+    bad = ~np.isfinite(states).reshape(len(states), -1).all(axis=1)
+    bad[1:] |= ~np.isfinite(rewards)
+    if bad.any():
+        raise ValueError(_not_finite(env, int(np.argmax(bad))))
+
+
+def _not_finite(env: gymnasium.Env, step: int) -> str:
+    where = f"step {step}" if step else "its reset"
+    return (
+        f"environment {environment_name(env)}: expected finite observations and rewards, got NaN or infinity at {where}"
+    )
+
+
+def _start(dynamics: FuncEnv, key: jax.Array) -> tuple[tuple[Any, Any, Any], jax.Array]:
+    start_key, steps_key = jax.random.split(key)
+    state, observation = functional.reset(dynamics, start_key)
+    return (state, _wide(dynamics, observation), jnp.asarray(True)), steps_key
+
+
+def _advance(dynamics: FuncEnv, policy: Any, running: tuple[Any, Any, Any], steps_key: jax.Array, t: Any) -> Any:
+    """One step of one episode; an episode that has ended stays as it is and earns nothing."""
+    state, observation, alive = running
+    action_key, transition_key = jax.random.split(jax.random.fold_in(steps_key, t))
+    action = _clipped(dynamics.action_space, policy.sample(action_key, observation))
+    next_state, next_observation, reward, terminated = functional.step(dynamics, transition_key, state, action)
+
+    def kept(new: Any, old: Any) -> Any:
+        return jnp.where(alive, new, old).astype(old.dtype)
+
+    next_state = jax.tree.map(kept, next_state, jax.tree.map(jnp.asarray, state))
+    next_observation = kept(_wide(dynamics, next_observation), observation)
+    terminated = alive & jnp.asarray(terminated, bool)
+    outcome = (action, jnp.where(alive, jnp.asarray(reward, float), 0.0), terminated, alive)
+    return (next_state, next_observation, alive & ~terminated), outcome
+
+
+@partial(jax.jit, static_argnames=("dynamics", "episodes", "steps"))
+def _simulate(dynamics: FuncEnv, policy: Any, key: jax.Array, *, episodes: int, steps: int) -> Any:
+    def episode(key: jax.Array) -> Any:
+        running, steps_key = _start(dynamics, key)
+        first = running[1]
+
+        def scan_step(running: Any, t: Any) -> Any:
+            running, outcome = _advance(dynamics, policy, running, steps_key, t)
+            return running, (running[1], *outcome)
+
+        _, (observations, actions, rewards, terminated, alive) = jax.lax.scan(scan_step, running, jnp.arange(steps))
+        return jnp.concatenate([first[None], observations]), actions, rewards, terminated.any(), alive.sum()
+
+    return jax.vmap(episode)(jax.random.split(key, episodes))
+
+
+@partial(jax.jit, static_argnames=("dynamics", "episodes"))
+def _evaluate(dynamics: FuncEnv, policy: Any, key: jax.Array, steps: Any, *, episodes: int) -> Any:
+    """Sums instead of trajectories, in a loop that stops once every episode has ended; new `steps` compile nothing."""
+    running, steps_keys = jax.vmap(partial(_start, dynamics))(jax.random.split(key, episodes))
+    advance = jax.vmap(partial(_advance, dynamics, policy), in_axes=(0, 0, None))
+
+    def loop_step(carry: Any) -> Any:
+        t, (state, observation, alive), total, length, terminated, finite = carry
+        (state, observation, still), (_, reward, ended, _) = advance((state, observation, alive), steps_keys, t)
+        finite &= jnp.isfinite(reward) & jnp.isfinite(observation.reshape(episodes, -1)).all(axis=1)
+        length = length + alive
+        return t + 1, (state, observation, still & finite), total + reward, length, terminated | ended, finite
+
+    def goes_on(carry: Any) -> Any:
+        return (carry[0] < steps) & carry[1][2].any()
+
+    none = jnp.zeros(episodes, bool)
+    start_finite = jnp.isfinite(running[1].reshape(episodes, -1)).all(axis=1)
+    running = (running[0], running[1], running[2] & start_finite)
+    carry = (jnp.asarray(0), running, jnp.zeros(episodes), jnp.zeros(episodes, int), none, start_finite)
+    return jax.lax.while_loop(goes_on, loop_step, carry)[2:]
+
+
+def _wide(dynamics: FuncEnv, observation: Any) -> jax.Array:
+    return jnp.asarray(observation).astype(float if isinstance(dynamics.observation_space, Box) else int)
+
+
+def _clipped(space: Any, action: Any) -> jax.Array:
+    if not isinstance(space, Box):
+        return jnp.asarray(action).astype(int)
+    low, high = np.asarray(space.low, float), np.asarray(space.high, float)
+    return jnp.clip(jnp.reshape(jnp.asarray(action, float), space.shape), low, high)
+
+
+@jax.jit
+def _act(policy: Any, key: jax.Array, counter: Any, observations: jax.Array) -> jax.Array:
+    keys = jax.random.split(jax.random.fold_in(key, counter), len(observations))
+    return jax.vmap(policy.sample)(keys, observations)
+
+
+def _act_one_by_one(policy: Any, key: jax.Array, counter: int, observations: np.ndarray) -> np.ndarray:
+    """For a policy that is an ordinary Python object."""
+    keys = jax.random.split(jax.random.fold_in(key, counter), len(observations))
+    return np.stack([np.asarray(policy.sample(*pair)) for pair in zip(keys, observations, strict=True)])
+
+
+def _by_interface(
+    env: gymnasium.Env, policy: Any, key: jax.Array, episodes: int, steps: int, explicit: bool
+) -> Iterator[Trajectory]:
+    seed_key, policy_key = jax.random.split(key)
+    seed = int(jax.random.randint(seed_key, (), 0, 2**30))
+    choose = _act if _is_pytree(policy) else _act_one_by_one
+
+    def act(counter: int, observations: np.ndarray) -> np.ndarray:
+        with jax.enable_x64(True):
+            actions = np.asarray(choose(policy, policy_key, counter, observations))
+        if not np.isfinite(actions).all():
+            raise ValueError(f"policy {type(policy).__name__}: expected finite actions, got NaN or infinity")
+        return actions
+
+    time_limit = steps if explicit else None
+    for states, actions, rewards, terminated in episodes_by_interface(
+        env, act, seed=seed, episodes=episodes, steps=steps, time_limit=time_limit
+    ):
+        yield Trajectory(states, actions, rewards, terminated)
