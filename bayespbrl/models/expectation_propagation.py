@@ -1,0 +1,127 @@
+"""Expectation propagation: a Gaussian close to the posterior of z given margins t = L z, and its log evidence (Minka 2001).
+
+Each answer's factor p_k(t_k) is replaced by a Gaussian in t_k; all factors are updated at once, damped. It is done in
+NumPy because it is a handful of small dense factorisations, once for each fit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+from scipy.special import log_ndtr, logsumexp
+
+from bayespbrl.models.likelihoods import ProbitMixture
+
+
+@dataclass(frozen=True)
+class GaussianApproximation:
+    """N(mean, covariance) in r dimensions, as expectation propagation left it.
+
+    Attributes:
+      mean: shape (r,).
+      covariance: shape (r, r).
+      site_precisions, site_shifts: the factors exp(−τ t²/2 + ν t) that stand for the answers, shapes (K,).
+      log_evidence: expectation propagation's log ∫ p(answers | z) p(z) dz.
+      sweeps: updates of all factors that were done.
+      converged: whether the last update changed the margins' means and standard deviations by less than the tolerance.
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    site_precisions: np.ndarray
+    site_shifts: np.ndarray
+    log_evidence: float
+    sweeps: int
+    converged: bool
+
+
+def tilted_moments(
+    means: np.ndarray, variances: np.ndarray, mixture: ProbitMixture
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """log Z, mean and variance of N(t; mean, variance) p(t) / Z for each of K margins, in closed form.
+
+    Z(μ) = c + Σⱼ aⱼ Φ(xⱼ), xⱼ = (μ − oⱼ)/√(s² + hⱼ²); the moments are its first two derivatives in μ.
+    """
+    spread = np.sqrt(variances[:, None] + mixture.scales**2)
+    x = (means[:, None] - mixture.offsets) / spread
+    weights = np.broadcast_to(mixture.weights, x.shape)
+    # terms relative to the largest keep their precision where all of Z is tiny
+    log_cdf = log_ndtr(x)
+    top = np.max(np.where(weights != 0, log_cdf, -np.inf), axis=1, keepdims=True)
+    constant = mixture.constant * np.exp(np.minimum(-top[:, 0], 700))
+    density = weights * np.exp(-0.5 * x**2 - 0.5 * np.log(2 * np.pi) - top) / spread
+    z = np.maximum(constant + np.sum(weights * np.exp(log_cdf - top), axis=1), np.finfo(float).tiny)
+    slope = np.sum(density, axis=1) / z
+    curvature = np.sum(-density * x / spread, axis=1) / z - slope**2
+    tilted_variance = variances + variances**2 * curvature
+    return top[:, 0] + np.log(z), means + variances * slope, np.maximum(tilted_variance, 1e-12 * variances)
+
+
+def expectation_propagation(
+    loadings: np.ndarray,
+    mixture: ProbitMixture,
+    *,
+    prior_scale: float,
+    max_sweeps: int = 200,
+    damping: float = 0.7,
+    tolerance: float = 1e-6,
+) -> GaussianApproximation:
+    """Fit the posterior of z ~ N(0, σ²I_r) given answers to the margins t = L z.
+
+    Args:
+      loadings: L, shape (K, r).
+      mixture: the answers' likelihood.
+      prior_scale: σ > 0.
+      max_sweeps: cap on the updates of all factors.
+      damping: share of each update that is taken, in (0, 1]; halved whenever an update would leave no Gaussian.
+      tolerance: change of the margins' moments, in standard deviations, that counts as none.
+    """
+    number, rank = loadings.shape
+    precisions, shifts = np.zeros(number), np.zeros(number)
+    gaussian = _moments(loadings, precisions, shifts, prior_scale)
+    converged, sweeps = False, 0
+    while sweeps < max_sweeps and not converged and number:
+        sweeps += 1
+        _, _, t_mean, t_variance, _ = gaussian
+        cavity = 1 / np.maximum(1 - t_variance * precisions, 1e-10)
+        cavity_variance = t_variance * cavity
+        cavity_mean = (t_mean - t_variance * shifts) * cavity
+        _, mean, variance = tilted_moments(cavity_mean, cavity_variance, mixture)
+        # an outlier's factor can be convex in log: negative precisions are kept only while the product stays proper
+        new_precisions = np.maximum(1 / variance - 1 / cavity_variance, 0.0)
+        new_shifts = mean / variance - cavity_mean / cavity_variance + 0.0
+        new_shifts = np.where(new_precisions > 0, new_shifts, (mean - cavity_mean) / cavity_variance)
+        precisions = precisions + damping * (new_precisions - precisions)
+        shifts = shifts + damping * (new_shifts - shifts)
+        gaussian = _moments(loadings, precisions, shifts, prior_scale)
+        change = np.abs(gaussian[2] - t_mean) + np.abs(np.sqrt(gaussian[3]) - np.sqrt(t_variance))
+        converged = bool(np.all(change <= tolerance * np.sqrt(t_variance)))
+    mean, covariance, *_ = gaussian
+    evidence = _log_evidence(gaussian, precisions, shifts, mixture) if number else 0.0
+    return GaussianApproximation(mean, covariance, precisions, shifts, evidence, sweeps, converged or not number)
+
+
+def _moments(loadings, precisions, shifts, prior_scale):
+    """Mean and covariance of z, mean and variance of t, and log ∫ N(z; 0, σ²I) Π exp(−τ t²/2 + ν t) dz."""
+    rank = loadings.shape[1]
+    # scaled by σ, the precision is at least the identity: always well conditioned enough for Cholesky
+    scaled = prior_scale * loadings
+    factor = np.linalg.cholesky(np.eye(rank) + (scaled.T * precisions) @ scaled)
+    half = solve_triangular(factor, scaled.T, lower=True) if rank else scaled.T
+    direction = half @ shifts
+    mean = prior_scale * (solve_triangular(factor.T, direction, lower=False) if rank else direction)
+    covariance = prior_scale**2 * (cho_solve((factor, True), np.eye(rank)) if rank else np.eye(rank))
+    log_normaliser = 0.5 * direction @ direction - np.sum(np.log(np.diag(factor)))
+    return mean, covariance, half.T @ direction, np.sum(half**2, axis=0), float(log_normaliser)
+
+
+def _log_evidence(gaussian, precisions, shifts, mixture):
+    """log Z = Σ_k [log Z_k(cavity) − log ∫ cavity · site] + log ∫ prior · sites (Rasmussen & Williams 2006, eq. 3.65)."""
+    _, _, t_mean, t_variance, log_normaliser = gaussian
+    cavity = 1 / np.maximum(1 - t_variance * precisions, 1e-10)
+    variance, mean = t_variance * cavity, (t_mean - t_variance * shifts) * cavity
+    log_tilted, _, _ = tilted_moments(mean, variance, mixture)
+    grown = 1 + variance * precisions
+    # ∫ N(t; mean, variance) exp(−τ t²/2 + ν t) dt
+    log_site = -0.5 * np.log(grown) + (shifts * mean + 0.5 * variance * shifts**2 - 0.5 * precisions * mean**2) / grown
+    return float(np.sum(log_tilted - log_site) + log_normaliser)

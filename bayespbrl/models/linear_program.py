@@ -1,0 +1,64 @@
+"""Linear PBIRL: the utility weights that violate the answers least (eq. 10), as a linear program."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+
+@dataclass(frozen=True)
+class LinearProgramResult:
+    """Solution of eq. 10.
+
+    Attributes:
+      weights: w, |w_j| ≤ 1, shape (D,).
+      objective: Σ_k c(d_k), c(x) = x for x > 0 and 2x otherwise.
+      status: the solver's own words.
+      converged: whether the solver reports an optimum.
+    """
+
+    weights: np.ndarray
+    objective: float
+    status: str
+    converged: bool
+
+
+def linear_program(differences: np.ndarray) -> LinearProgramResult:
+    """Maximise Σ_k c(d_k) over |w_j| ≤ 1 with d = differences @ w (eq. 10), by HiGHS through CasADi.
+
+    c is concave, c(x) = min(x, 2x), so the maximum is a linear program: max Σ t_k, t_k ≤ d_k, t_k ≤ 2 d_k. With
+    d_k = p_k − n_k, p, n ≥ 0, it is max Σ p_k − 2 n_k under K equations, half as many rows.
+
+    Args:
+      differences: ψ(preferred) − ψ(dominated), shape (K, D), used as given.
+
+    Raises:
+      ValueError: `differences` is not a finite matrix.
+    """
+    differences = np.asarray(differences, dtype=float)
+    if differences.ndim != 2 or not np.all(np.isfinite(differences)):
+        raise ValueError(f"differences: expected a finite matrix (K, D), got shape {differences.shape} or NaN/infinity")
+    number, dimension = differences.shape
+    if number == 0 or dimension == 0:
+        return LinearProgramResult(np.zeros(dimension), 0.0, "nothing to solve", True)
+    constraints = ca.DM(np.hstack([differences, -np.eye(number), np.eye(number)]))
+    cost = np.concatenate([np.zeros(dimension), -np.ones(number), 2 * np.ones(number)])
+    solver = ca.conic(
+        "linear_program",
+        "highs",
+        {"a": constraints.sparsity(), "h": ca.Sparsity(len(cost), len(cost))},
+        {"error_on_fail": False, "highs": {"output_flag": False}},
+    )
+    lower = np.concatenate([-np.ones(dimension), np.zeros(2 * number)])
+    upper = np.concatenate([np.ones(dimension), np.full(2 * number, np.inf)])
+    solution = solver(a=constraints, g=cost, lbx=lower, ubx=upper, lba=0, uba=0)
+    statistics = solver.stats()
+    # the bounds hold to the solver's tolerance; clipping makes them exact
+    weights = np.clip(np.asarray(solution["x"]).ravel()[:dimension], -1, 1)
+    margins = differences @ weights
+    return LinearProgramResult(
+        weights,
+        float(np.sum(np.minimum(margins, 2 * margins))),
+        str(statistics["return_status"]),
+        bool(statistics["success"]),
+    )

@@ -1,0 +1,80 @@
+"""The part of the utility that the answers can see: Ψ = L Qᵀ, w = Q z + complement (thin factorisation of the differences).
+
+The likelihood depends on w only through the margins t = Ψ w = L z with z = Qᵀ w ~ N(0, σ²I_r), r = rank Ψ ≤ K. What is
+orthogonal to Q keeps its prior: its draws are exact prior noise and its posterior mean is exactly zero.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from xarray.backends import BackendArray
+from xarray.core import indexing
+
+
+@dataclass(frozen=True)
+class LowRank:
+    """Ψ = L Qᵀ.
+
+    Attributes:
+      loadings: L, shape (K, r). Rows of zero differences are exactly zero.
+      basis: Q with orthonormal columns, shape (D, r).
+    """
+
+    loadings: np.ndarray
+    basis: np.ndarray
+
+
+def low_rank(differences: np.ndarray) -> LowRank:
+    """Factorise `differences` (K, D), independently of the scale of each row.
+
+    Rows are scaled to unit length before the factorisation, so that a small row keeps its sign, and exactly zero rows are
+    set aside: rounding would otherwise turn them into hard constraints. The rank counts the singular values above
+    max(K, D) ε times the largest.
+    """
+    lengths = np.linalg.norm(differences, axis=1)
+    used = lengths > 0
+    loadings, basis = np.zeros((len(differences), 0)), np.zeros((differences.shape[1], 0))
+    if not used.any():
+        return LowRank(loadings, basis)
+    # QR first: its cost in D is that of one matrix product, and the decomposition that tells the rank is only (K, K)
+    directions, triangle = np.linalg.qr((differences[used] / lengths[used, None]).T)
+    left, values, right = np.linalg.svd(triangle.T)
+    rank = int(np.sum(values > values[0] * max(differences.shape) * np.finfo(float).eps))
+    loadings = np.zeros((len(differences), rank))
+    loadings[used] = lengths[used, None] * left[:, :rank] * values[:rank]
+    return LowRank(loadings, directions @ right[:rank].T)
+
+
+class UtilityWeights(BackendArray):
+    """Draws of w = Q z + σ (I − QQᵀ) ε, shape (C, draws, D), computed where they are indexed.
+
+    ε comes from a counter-based generator keyed by the seed, the chain and the draw: the same draw is the same array
+    however it is reached.
+    """
+
+    def __init__(self, coordinates: np.ndarray, basis: np.ndarray, *, prior_scale: float, seed: int) -> None:
+        self.coordinates, self.basis = coordinates, basis
+        self.prior_scale, self.seed = prior_scale, seed
+        self.shape = (*coordinates.shape[:2], len(basis))
+        self.dtype = np.dtype(np.float64)
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> np.ndarray:
+        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._outer)
+
+    def _outer(self, key: tuple) -> np.ndarray:
+        chains, draws = (np.atleast_1d(np.arange(n)[k]) for n, k in zip(self.shape[:2], key[:2], strict=True))
+        weights = np.empty((len(chains), len(draws), self.shape[2]))
+        for i, chain in enumerate(chains):
+            for j, draw in enumerate(draws):
+                weights[i, j] = self.draw(int(chain), int(draw))
+        keep = tuple(0 if np.ndim(k) == 0 and not isinstance(k, slice) else slice(None) for k in key[:2])
+        return weights[(*keep, key[2])]
+
+    def draw(self, chain: int, draw: int) -> np.ndarray:
+        """One draw of w, shape (D,)."""
+        generator = np.random.Generator(np.random.Philox(key=self.seed, counter=[0, 0, chain, draw]))
+        noise = self.prior_scale * generator.standard_normal(self.shape[2])
+        # twice: one projection leaves a rounding error of the size of the margins' smallest directions
+        for _ in range(2):
+            noise -= self.basis @ (self.basis.T @ noise)
+        return self.basis @ self.coordinates[chain, draw] + noise
