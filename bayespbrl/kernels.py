@@ -80,8 +80,8 @@ def median_bandwidths(
 ) -> np.ndarray:
     """factor × sqrt(median over pairs of the squared difference), per dimension; specification's median rule.
 
-    The median is over `number_of_pairs` random pairs of rows of `points` (N, S), periodic differences wrapped. Where more
-    than half of the pairs agree the mean takes the median's place; only a constant dimension gets bandwidth zero.
+    The median is over `number_of_pairs` random pairs of rows of `points` (N, S), periodic differences wrapped. Where
+    more than half of the pairs agree the mean takes the median's place; only a constant dimension gets bandwidth zero.
     Shape (S,), in the units of `points`.
     """
     if not factor > 0:

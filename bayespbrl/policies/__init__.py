@@ -1,7 +1,8 @@
 """Stochastic policies: tabular, softmax, linear-Gaussian, Gaussian process."""
 
 from bayespbrl.policies.batch import entropies, log_probabilities, sample_actions
+from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.policy import Policy
 from bayespbrl.policies.tabular import TabularPolicy
 
-__all__ = ["Policy", "TabularPolicy", "entropies", "log_probabilities", "sample_actions"]
+__all__ = ["GaussianProcessPolicy", "Policy", "TabularPolicy", "entropies", "log_probabilities", "sample_actions"]

@@ -13,6 +13,7 @@ class WeightedSamples:
       observations: shape (N, S) float64, or (N,) int64 where discrete.
       actions: shape (N, A) float64, or (N,) int64 where discrete.
       weights: N·Wᵢ·wᵢ with Σ Wᵢ = 1, i.e. wᵢ itself where the base weights are uniform; mean 1 if w has mean 1 under W.
+        All positive: samples without weight are left out, so that they cannot even change what is drawn at random.
     """
 
     observations: np.ndarray
@@ -52,7 +53,8 @@ def weighted_samples(
         weights = weights * base * (number / base.sum())
         if not weights.sum() > 0:
             raise ValueError("sample_weights: expected some mass where base_weights have some, got none")
-    return WeightedSamples(observations, actions, weights)
+    kept = weights > 0
+    return WeightedSamples(observations[kept], actions[kept], weights[kept])
 
 
 def _checked(name: str, values: np.ndarray, count: int | None, dimension: int | None) -> np.ndarray:

@@ -1,0 +1,119 @@
+"""Weighted sparse Gaussian process regression (specification, section 8): FITC with the noise σ²/wᵢ a sample.
+
+Snelson and Ghahramani (2006) for the inducing points, Kober et al. (2010) for the weights. Everything is written in
+v(x) = L⁻¹r(x), with r = k/s² the correlations of x with the M inducing points, s² the signal variance and LLᵀ = R_M:
+
+  Λᵢᵢ = s²(1 − |vᵢ|²) + σ²/wᵢ ;  B/s² = L(I + s² VΛ⁻¹Vᵀ)Lᵀ ;  mean = s² vᵀ(I + s² VΛ⁻¹Vᵀ)⁻¹VΛ⁻¹y
+
+which inverts nothing worse conditioned than R_M, and needs no sample's noise to be finite (wᵢ = 0 drops out).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from bayespbrl.kernels import squared_exponential
+
+JITTER = 1e-8  # relative to the signal variance; the kernel's rounding errors are near 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class SparseRegression:
+    """The posterior of one output at any x, from the correlations r(x) with the inducing points.
+
+    Attributes:
+      mean_weights: mean(x) = r(x)ᵀ mean_weights; shape (M,).
+      reduction: var(x) = s²(1 − |reduction · r(x)|²) + σ², and the norm stays below one; shape (M, M).
+    """
+
+    mean_weights: np.ndarray
+    reduction: np.ndarray
+
+
+def whitened_correlations(correlations: np.ndarray, inducing_correlations: np.ndarray) -> np.ndarray:
+    """V = L⁻¹R_MN for correlations (M, N) of inducing points with samples; shape (M, N), columns of norm ≤ 1."""
+    return solve_triangular(_factor(inducing_correlations), correlations, lower=True, check_finite=False)
+
+
+def precisions(
+    whitened: np.ndarray, weights: np.ndarray, *, signal_variance: float, noise_variance: float
+) -> np.ndarray:
+    """Λ⁻¹, as w/(w s²(1 − |v|²) + σ²); shape (N,)."""
+    unexplained = np.maximum(1.0 - np.einsum("mn,mn->n", whitened, whitened), 0.0)
+    return weights / (weights * (signal_variance * unexplained) + noise_variance)
+
+
+def fit_sparse_regression(
+    correlations: np.ndarray,
+    inducing_correlations: np.ndarray,
+    targets: np.ndarray,
+    weights: np.ndarray,
+    *,
+    signal_variance: float,
+    noise_variance: float,
+) -> SparseRegression:
+    """FITC posterior for a prior of mean zero. Cost O(NM²).
+
+    Args:
+      correlations: r(zₘ, xᵢ), shape (M, N).
+      inducing_correlations: r(zₘ, zₙ), shape (M, M).
+      targets, weights: yᵢ and wᵢ ≥ 0 (a weight of two counts as two samples where Z is the data), shape (N,).
+      signal_variance, noise_variance: s² and σ², > 0, in the square of the target's units.
+    """
+    lower = _factor(inducing_correlations)
+    whitened = solve_triangular(lower, correlations, lower=True, check_finite=False)
+    precision = precisions(whitened, weights, signal_variance=signal_variance, noise_variance=noise_variance)
+    scaled = whitened * precision
+    information, rotation = np.linalg.eigh(signal_variance * (scaled @ whitened.T))
+    information = np.maximum(information, 0.0)
+    back = solve_triangular(lower, rotation, lower=True, trans="T", check_finite=False)  # L⁻ᵀU
+    projected = rotation.T @ (scaled @ targets)
+    mean_weights = signal_variance * (back @ (projected / (1.0 + information)))
+    # K_M⁻¹ − B⁻¹ = L⁻ᵀ(I − (I + UλUᵀ)⁻¹)L⁻¹/s² as one square: the variance cannot come out negative
+    reduction = np.sqrt(information / (1.0 + information))[:, None] * back.T
+    return SparseRegression(mean_weights, reduction)
+
+
+def inducing_rows(
+    points: np.ndarray, weights: np.ndarray, number: int, *, rng: np.random.Generator, candidates: int = 2000
+) -> np.ndarray:
+    """Rows of `points` to induce from: where the weight lies, and no two where one would do.
+
+    Randomly pivoted Cholesky (Chen, Epperly, Tropp and Webber 2023): each next row is drawn in proportion to the prior
+    variance that the rows before it leave unexplained, among `candidates` rows drawn in proportion to their weight.
+    Weighted random rows spend their points twice over in dense regions; a greedy choice spends them on outliers.
+
+    Args:
+      points: scaled kernel coordinates, shape (N, E).
+      weights: > 0, shape (N,).
+      number: M; fewer rows come back where they already explain every candidate.
+    """
+    keys = np.log(weights) + rng.gumbel(size=len(weights))  # the largest keys: a draw by weight without replacement
+    size = min(candidates, len(points))
+    chosen = np.sort(np.argpartition(-keys, size - 1)[:size])
+    pool = points[chosen]
+    unexplained = np.ones(size)
+    factors = np.empty((min(number, size), size))
+    pivots: list[int] = []
+    while len(pivots) < len(factors) and unexplained.max() > JITTER:
+        rank = len(pivots)
+        cumulative = np.cumsum(unexplained)
+        pivot = int(np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right"))
+        pivot = min(pivot, size - 1)
+        column = squared_exponential(pool, pool[pivot : pivot + 1])[:, 0]
+        column -= factors[:rank, pivot] @ factors[:rank]
+        if column[pivot] <= JITTER:  # rounding: this row is explained already
+            unexplained[pivot] = 0.0
+            continue
+        factors[rank] = column / np.sqrt(column[pivot])
+        unexplained = np.maximum(unexplained - np.square(factors[rank]), 0.0)
+        unexplained[pivot] = 0.0
+        pivots.append(pivot)
+    return chosen[pivots]
+
+
+def _factor(inducing_correlations: np.ndarray) -> np.ndarray:
+    """L with LLᵀ = R_M + jitter."""
+    jittered = inducing_correlations + JITTER * np.eye(len(inducing_correlations))
+    return cholesky(jittered, lower=True, check_finite=False)
