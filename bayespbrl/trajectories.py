@@ -1,6 +1,6 @@
 """Trajectories τ = (s₀, a₀, s₁, …, s_T): what step 3 produces and what experts compare (paper, MDP\\R)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,8 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         steps = len(self.actions)
+        if steps == 0:
+            raise ValueError("trajectory: expected at least one step, got none")
         if len(self.states) != steps + 1 or len(self.rewards) != steps:
             raise ValueError(
                 f"trajectory: expected T+1 states, T actions and T rewards, got {len(self.states)} states, "
@@ -78,3 +80,24 @@ def transitions(trajectories: Sequence[Trajectory]) -> Transitions:
         rewards=np.concatenate([t.rewards for t in trajectories]),
         terminal=np.concatenate(terminal),
     )
+
+
+def trajectory_features(
+    trajectories: Sequence[Trajectory], features: Callable[[np.ndarray], np.ndarray], *, discount: float
+) -> np.ndarray:
+    """ψ(τ) = Σₜ γᵗ φ(sₜ₊₁), t = 0 … T−1, of each trajectory; shape (n, D).
+
+    Decision: features of the *next* state, as in the authors' published implementation and as in LSTD here (eq. 1
+    sums from s₀, which no choice of the policy can change).
+
+    Args:
+      trajectories: n of them, of any lengths.
+      features: φ, from (N, S) states to (N, D).
+      discount: γ in [0, 1].
+    """
+    if not trajectories:
+        raise ValueError("trajectory_features: expected at least one trajectory, got none")
+    table = features(np.concatenate([t.states[1:] for t in trajectories]))
+    discounts = np.concatenate([discount ** np.arange(len(t)) for t in trajectories])
+    starts = np.cumsum([0] + [len(t) for t in trajectories[:-1]])
+    return np.add.reduceat(table * discounts[:, None], starts, axis=0)

@@ -1,0 +1,329 @@
+"""The learner: orders the four steps of the cycle (paper, "Online Preference-Based Reinforcement Learning")."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from bayespbrl import events, improvement, queries, rollouts, utility
+from bayespbrl.envs.opening import environment_name
+from bayespbrl.events import Entry, LearnerState, Log
+from bayespbrl.experts import Expert
+from bayespbrl.features import checked_features, draw_state_action_features, draw_state_features
+from bayespbrl.policies.choice import initial_policy
+from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
+from bayespbrl.settings import Settings, settings_for
+from bayespbrl.trajectories import Trajectory, transitions
+
+# Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE = range(7)
+
+
+class Learner:
+    """Learns a policy from answers to "which of these two trajectories is better?".
+
+    `ask()` returns the questions that wait for an answer, `tell(answers)` moves on; `run(expert)` is a loop over the
+    two. Whatever happens is appended to a log first, and the state is a fold over that log.
+
+    Args:
+      env: a short name (`gridworld`, …), a gymnasium id, or an environment.
+      features: φ of your own, from observations (N, S) to (N, D); drawn by the settings when None.
+      policy: a first policy of your own; chosen by the settings when None.
+      log: where events go; None keeps no record beyond the state.
+      entries: events of a run to continue.
+      **settings: options of `Settings`, over the preset of the environment.
+
+    Raises:
+      ValueError: an unknown environment or option, or a value out of range.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        *,
+        features: utility.StateFeatures | None = None,
+        policy: Any = None,
+        log: Log | None = None,
+        entries: Iterable[Entry] = (),
+        **settings: Any,
+    ):
+        self.environment = rollouts.open_environment(env)
+        self.settings: Settings = settings_for(env if isinstance(env, str) else environment_name(env), **settings)
+        self.features = features
+        self._log = log
+        if policy is None:
+            policy = initial_policy(
+                self.settings.policy,
+                self.environment.observation_space,
+                self.environment.action_space,
+                action_scale=self.settings.initial_action_scale,
+                period=self._period,
+            )
+        self.state = events.replay(LearnerState(policy), entries)
+
+    # What a user reads off.
+
+    @property
+    def finished(self) -> bool:
+        """Whether all iterations are completed."""
+        return self.state.iteration >= self.settings.iterations
+
+    @property
+    def policy(self) -> Any:
+        return self.state.policy
+
+    @property
+    def estimate(self) -> Any:
+        """The last utility estimate; None before the first."""
+        return self.state.estimate
+
+    @property
+    def preferences(self) -> Preferences:
+        return self.state.preferences
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        return self.state.trajectories
+
+    @property
+    def iterations(self) -> list[dict[str, Any]]:
+        """One summary for each completed iteration."""
+        return [dict(summary) for summary in self.state.summaries]
+
+    # Ask and tell.
+
+    def ask(self) -> list[Query]:
+        """The question that waits for an answer, after doing whatever comes before it; empty when finished.
+
+        Each new trajectory is compared with the best of all before it, so there is one question at a time.
+        """
+        self._advance()
+        return [] if self.state.query is None else [self.state.query]
+
+    def tell(self, answers: Sequence[Answer | str]) -> None:
+        """Take in the answer to the question that waits, and move on as far as possible without another.
+
+        Raises:
+          ValueError: an answer that is none, or not as many answers as questions; nothing has happened then.
+        """
+        waiting = 0 if self.state.query is None else 1
+        if isinstance(answers, str) or len(answers) != waiting:
+            raise ValueError(f"tell: expected {waiting} answers in a list, got {answers!r}")
+        for answer in map(parse_answer, answers):
+            if answer is Answer.UNDO:
+                self.undo()
+            else:
+                assert_query = self.state.query
+                self._record({"event": "answered", "query": assert_query.number, "answer": str(answer)})
+        self._advance()
+
+    def undo(self) -> None:
+        """Take the last answer back, and what followed from it; its question waits again.
+
+        Raises:
+          ValueError: nothing has been answered yet.
+        """
+        self._record({"event": "undone"})
+
+    def run(self, expert: Expert, *, progress: Callable[["Learner"], None] | None = None) -> "Learner":
+        """Ask `expert` until all iterations are completed.
+
+        Args:
+          expert: called with the two trajectories in the order shown.
+          progress: called after each answer.
+        """
+        while questions := self.ask():
+            answers = [parse_answer(expert(*query.trajectories)) for query in questions]
+            if answers == [Answer.UNDO] and self.state.previous is None:
+                continue  # nothing to take back: the same question again
+            self.tell(answers)
+            if progress is not None:
+                progress(self)
+        return self
+
+    # The four steps.
+
+    def _advance(self) -> None:
+        """Do what can be done without an answer."""
+        while self.state.query is None and not self.finished:
+            if not self.state.collected:
+                self._collect()
+            elif self.state.wanted and self.state.candidates:
+                self._show()
+            else:
+                self._improve()
+
+    def _collect(self) -> None:
+        """Steps 3 and 4: new trajectories, and which of them to ask about."""
+        state, settings = self.state, self.settings
+        began = time.perf_counter()
+        collected = rollouts.rollout(
+            self.environment,
+            state.policy,
+            key=self._key(COLLECT, state.iteration),
+            episodes=settings.trajectories_per_iteration,
+            max_steps=settings.max_steps,
+        )
+        numbers = range(len(state.trajectories), len(state.trajectories) + len(collected))
+        if state.estimate is None:
+            wanted = settings.first_queries
+            candidates = queries.random_candidates(numbers, rng=self._rng(CHOOSE, state.iteration))
+        else:
+            wanted = settings.queries_per_iteration
+            candidates = queries.highest_utility_candidates(numbers, state.estimate.trajectory_utilities(collected))
+        event = {
+            "event": "collected",
+            "iteration": state.iteration + 1,
+            "candidates": list(candidates),
+            "wanted": wanted,
+            "seconds": time.perf_counter() - began,
+        }
+        self._record(event, trajectories=collected)
+
+    def _show(self) -> None:
+        """Step 4: the next question, the best candidate against the newest of the undominated."""
+        state = self.state
+        number = state.queries + 1
+        newcomer, incumbent = state.candidates[0], state.preferences.undominated[-1]
+        query = queries.show(number, newcomer, incumbent, state.trajectories, rng=self._rng(SHOW, number))
+        self._record(
+            {"event": "asked", "query": number, "first": query.first, "second": query.second, "newcomer": newcomer}
+        )
+
+    def _improve(self) -> None:
+        """Steps 1 and 2, and the value of the new policy, which the learner does not see."""
+        state, settings = self.state, self.settings
+        clock = [time.perf_counter()]
+        estimate = self._estimate()
+        clock.append(time.perf_counter())
+        steps = transitions(state.trajectories)
+        update = self._update(estimate, steps)
+        clock.append(time.perf_counter())
+        value = rollouts.returns(
+            self.environment,
+            update.policy,
+            key=self._key(EVALUATE, 0),
+            episodes=settings.evaluation_episodes,
+            max_steps=settings.max_steps,
+        ).total.mean()
+        clock.append(time.perf_counter())
+        seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
+        summary = _summary(state, estimate, update, float(value), seconds)
+        size = settings.trajectories_per_iteration
+        self._record(
+            {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
+            trajectories=state.trajectories[-size:],
+            policy=update.policy,
+            estimate=estimate,
+        )
+
+    def _estimate(self) -> Any:
+        settings = self.settings
+        return utility.estimate_utility(
+            self.state.trajectories,
+            self.state.preferences.pairs,
+            self._state_features(self._rng(FEATURES, 2 * self.state.iteration)),
+            method=settings.utility,
+            discount=settings.discount,
+            prior_scale=settings.prior_scale,
+            steepness=settings.steepness,
+            lapse_rate=settings.lapse_rate,
+            likelihood=settings.likelihood,
+            seed=int(self._rng(FIT, self.state.iteration).integers(2**31)),
+        )
+
+    def _update(self, estimate: Any, steps: Any) -> improvement.Improvement:
+        settings, iteration = self.settings, self.state.iteration
+        rng = self._rng(FEATURES, 2 * iteration + 1)
+        state_action_features = draw_state_action_features(
+            self.environment.observation_space,
+            self.environment.action_space,
+            steps.states,
+            steps.actions,
+            rng=rng,
+            number_of_centres=settings.centres,
+            bandwidth_factor=settings.bandwidth_factor,
+            period=self._period,
+        )
+        return improvement.improve(
+            self.state.policy,
+            steps,
+            estimate.step_utilities(steps),
+            key=self._key(IMPROVE, iteration),
+            rng=self._rng(IMPROVE, iteration),
+            action_space=self.environment.action_space,
+            state_features=self._state_features(rng),
+            state_action_features=state_action_features,
+            kl_bound=settings.kl_bound,
+            discount=settings.discount,
+            fixed_point_ridge=settings.fixed_point_ridge,
+            projection_ridge=settings.projection_ridge,
+        )
+
+    def _state_features(self, rng: np.random.Generator) -> utility.StateFeatures:
+        """φ(s): the user's, or drawn anew at states observed so far."""
+        if self.features is not None:
+            features = self.features
+            return lambda states: checked_features(features, states)
+        observed = np.concatenate([trajectory.states for trajectory in self.state.trajectories])
+        return draw_state_features(
+            self.environment.observation_space,
+            observed,
+            rng=rng,
+            number_of_centres=self.settings.centres,
+            bandwidth_factor=self.settings.bandwidth_factor,
+            period=self._period,
+        )
+
+    @property
+    def _period(self) -> tuple[float, ...] | None:
+        return getattr(getattr(self.environment.unwrapped, "dynamics", None), "observation_period", None)
+
+    # Memory and chance.
+
+    def _record(self, event: dict[str, Any], **parts: Any) -> None:
+        """Append to the log first, then move on: what the learner knows is never ahead of what is kept."""
+        entry = Entry(event, parts)
+        state = events.apply(self.state, entry)
+        if self._log is not None:
+            self._log.append(entry)
+        self.state = state
+
+    def _rng(self, purpose: int, count: int) -> np.random.Generator:
+        return np.random.default_rng([self.settings.seed, purpose, count])
+
+    def _key(self, purpose: int, count: int) -> jax.Array:
+        return jax.random.key(int(self._rng(purpose, count).integers(2**31)))
+
+
+def _summary(
+    state: LearnerState, estimate: Any, update: improvement.Improvement, value: float, seconds: dict[str, float]
+) -> dict[str, Any]:
+    """What an iteration reports, as plain data."""
+    quality, reps = estimate.quality, update.reps
+    return {
+        "iteration": state.iteration + 1,
+        "answers": state.preferences.answers,
+        "pairs": quality.pairs,
+        "pairs_satisfied": quality.pairs_satisfied,
+        "value": value,
+        "kl_bound": reps.kl_bound,
+        "bound_active": reps.bound_active,
+        "kl": reps.kl,
+        "kl_fitted_policy": update.kl_fitted_policy,
+        "feature_gap": reps.feature_gap,
+        "feature_gap_raw": reps.feature_gap_raw,
+        "rank_kept": reps.rank_kept,
+        "effective_samples": reps.effective_samples,
+        "temperature": reps.temperature,
+        "reps_converged": reps.converged,
+        "entropy": update.entropy,
+        "rhat_max": quality.rhat_max,
+        "effective_sample_size_min": quality.effective_sample_size_min,
+        "utility_converged": quality.converged,
+        "utility_status": quality.status,
+        "log_evidence": quality.log_evidence,
+        "seconds": seconds,
+    }

@@ -1,0 +1,142 @@
+"""What happens in a run, and the learner's state that follows from it: a fold over an append-only log.
+
+Resume, undo, a person who answers next week and a report on a run in progress are all this fold. Five events:
+
+* `collected`: step 3 brought new trajectories, and these of them are to be asked about, in this order;
+* `asked`: a question was put, with the order in which the two were shown;
+* `answered`: the expert said something;
+* `improved`: steps 1 and 2 made a new estimate and a new policy: the end of an iteration;
+* `undone`: the last answer was taken back, and everything that followed from it.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+from bayespbrl.preferences import Answer, Preferences, Query
+from bayespbrl.trajectories import Trajectory
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One event and the heavy parts that came with it.
+
+    Attributes:
+      event: plain data, one line of the log.
+      parts: `collected` brings `trajectories`; `improved` brings `trajectories`, `policy` and `estimate`.
+    """
+
+    event: Mapping[str, Any]
+    parts: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Log(Protocol):
+    """Where entries go before the learner moves on."""
+
+    def append(self, entry: Entry) -> None: ...
+
+
+@dataclass(frozen=True)
+class LearnerState:
+    """Everything the learner knows between two calls.
+
+    Attributes:
+      policy: the current policy.
+      estimate: the last utility estimate; None before the first.
+      iteration: iterations completed.
+      trajectories: all of them, by number.
+      preferences: the answers so far.
+      collected: whether the next iteration's trajectories are among them.
+      candidates: new trajectories not asked about yet, best first.
+      wanted: answers still wanted in this iteration.
+      query: the question that waits for an answer.
+      queries: questions put so far.
+      summaries: one for each completed iteration.
+      previous: the state before the last answer.
+    """
+
+    policy: Any
+    estimate: Any = None
+    iteration: int = 0
+    trajectories: tuple[Trajectory, ...] = ()
+    preferences: Preferences = Preferences()
+    collected: bool = False
+    candidates: tuple[int, ...] = ()
+    wanted: int = 0
+    query: Query | None = None
+    queries: int = 0
+    summaries: tuple[Mapping[str, Any], ...] = ()
+    previous: "LearnerState | None" = field(default=None, repr=False)
+
+
+def apply(state: LearnerState, entry: Entry) -> LearnerState:
+    """The state after one more event.
+
+    Raises:
+      ValueError: an event there is not, or one that cannot follow this state.
+    """
+    event = entry.event
+    match event.get("event"):
+        case "collected":
+            return _collected(state, event, entry.parts)
+        case "asked":
+            shown = (event["first"], event["second"])
+            if any(not 0 <= number < len(state.trajectories) for number in shown):
+                raise ValueError(f"asked: expected trajectories below {len(state.trajectories)}, got {shown}")
+            both = (state.trajectories[shown[0]], state.trajectories[shown[1]])
+            query = Query(event["query"], *shown, event["newcomer"], both)
+            return replace(state, query=query, queries=event["query"])
+        case "answered":
+            return _answered(state, event)
+        case "improved":
+            return replace(
+                state,
+                policy=entry.parts["policy"],
+                estimate=entry.parts["estimate"],
+                iteration=event["iteration"],
+                collected=False,
+                candidates=(),
+                wanted=0,
+                summaries=(*state.summaries, event["summary"]),
+            )
+        case "undone":
+            if state.previous is None:
+                raise ValueError("undo: expected an answer to take back, got none yet")
+            return state.previous
+        case other:
+            raise ValueError(f"event: expected collected, asked, answered, improved or undone, got {other!r}")
+
+
+def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
+    """The state after all of `entries`."""
+    for entry in entries:
+        state = apply(state, entry)
+    return state
+
+
+def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:
+    candidates, preferences = tuple(event["candidates"]), state.preferences
+    if not preferences.undominated:
+        preferences, candidates = preferences.start(candidates[0]), candidates[1:]
+    return replace(
+        state,
+        trajectories=state.trajectories + tuple(parts["trajectories"]),
+        preferences=preferences,
+        collected=True,
+        candidates=candidates,
+        wanted=event["wanted"],
+    )
+
+
+def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
+    query = state.query
+    if query is None or query.number != event["query"]:
+        raise ValueError(f"answered: expected an answer to {query}, got one to question {event['query']}")
+    left = tuple(number for number in state.candidates if number != query.newcomer)
+    after = replace(state, query=None, candidates=left, previous=state)
+    answer = Answer(event["answer"])
+    if answer is Answer.SKIP:
+        return after
+    preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]
+    preferences = state.preferences.add(query.newcomer, query.incumbent, preferred=preferred)
+    return replace(after, preferences=preferences, wanted=state.wanted - 1)

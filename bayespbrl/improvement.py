@@ -1,0 +1,203 @@
+"""Step 2: from a utility to a better policy: LSTD-Q, actor-critic REPS, policy fit (paper, "Step 2")."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Box
+
+from bayespbrl.lstd import lstd_q
+from bayespbrl.policies import entropies, sample_actions
+from bayespbrl.reps import RepsSolution, reps_weights
+from bayespbrl.trajectories import Transitions
+
+
+@dataclass(frozen=True)
+class QFunction:
+    """Q(s, a) = [φ(s, a), 1]ᵀθ.
+
+    Attributes:
+      features: φ(s, a), from N states and N actions to (N, Q).
+      weights: θ, shape (Q + 1,); the last is the bias.
+    """
+
+    features: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    weights: np.ndarray
+
+    def __call__(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Q of N pairs, shape (N,)."""
+        return self.features(states, actions) @ self.weights[:-1] + self.weights[-1]
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """A policy update and what really happened in it.
+
+    Attributes:
+      policy: the new policy.
+      q_function: the estimate of Q under the old policy that it follows.
+      reps: sample weights, temperature, KL reached against its bound, feature gaps, rank kept, effective samples.
+      kl_fitted_policy: mean KL of the fitted policy from the old one over the states of the update, nats.
+      entropy: mean entropy of the fitted policy over the same states, nats.
+    """
+
+    policy: Any
+    q_function: QFunction
+    reps: RepsSolution
+    kl_fitted_policy: float
+    entropy: float
+
+
+def improve(
+    policy: Any,
+    steps: Transitions,
+    utilities: np.ndarray,
+    *,
+    key: jax.Array,
+    rng: np.random.Generator,
+    action_space: Space,
+    state_features: Callable[[np.ndarray], np.ndarray],
+    state_action_features: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    kl_bound: float,
+    discount: float,
+    fixed_point_ridge: float,
+    projection_ridge: float,
+) -> Improvement:
+    """One policy update of actor-critic REPS from all observed transitions.
+
+    Args:
+      policy: the current policy.
+      steps: N transitions observed so far, under whatever policies.
+      utilities: uᵢ of each, shape (N,).
+      key, rng: for the fresh actions and for the policy fit.
+      state_features: φ(s) of the constraint on the state distribution (eq. 11).
+      state_action_features: φ(s, a) of Q.
+      kl_bound: ε, nats.
+      discount, fixed_point_ridge, projection_ridge: of LSTD.
+
+    Raises:
+      ValueError: utilities that do not fit the transitions or are not finite.
+
+    Source: paper, step 2, eqs. 11-14.
+    """
+    if utilities.shape != (len(steps),) or not np.all(np.isfinite(utilities)):
+        raise ValueError(f"utilities: expected {len(steps)} finite numbers, got shape {utilities.shape} or NaN")
+    next_key, fresh_key = jax.random.split(key)
+    q_function = _estimate_q(
+        policy,
+        steps,
+        utilities,
+        key=next_key,
+        action_space=action_space,
+        features=state_action_features,
+        discount=discount,
+        fixed_point_ridge=fixed_point_ridge,
+        projection_ridge=projection_ridge,
+    )
+    states, visits = _visited(steps.states)
+    if is_discrete(policy):
+        rows, actions, base_weights = _all_actions(policy, states, visits)
+    else:
+        rows, base_weights = np.arange(len(states)), visits
+        actions = clipped(sample_actions(policy, fresh_key, states), action_space)
+    reps = reps_weights(
+        q_function(states[rows], actions), state_features(states)[rows], base_weights, kl_bound=kl_bound
+    )
+    fitted = policy.fit(states[rows], actions, reps.sample_weights, rng=rng, base_weights=base_weights)
+    return Improvement(
+        policy=fitted,
+        q_function=q_function,
+        reps=reps,
+        kl_fitted_policy=float(visits @ fitted.kl_divergence(policy, states)),
+        entropy=float(visits @ entropies(fitted, states)),
+    )
+
+
+def is_discrete(policy: Any) -> bool:
+    """Whether a policy's actions can be enumerated."""
+    return hasattr(policy, "probabilities")
+
+
+def clipped(actions: np.ndarray, action_space: Space) -> np.ndarray:
+    """Continuous actions as the environment will see them; discrete ones as they are."""
+    return np.clip(actions, action_space.low, action_space.high) if isinstance(action_space, Box) else actions
+
+
+def _visited(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The states of the update and the share of visits of each: discrete ones are counted, not repeated."""
+    if states.ndim > 1:
+        return states, np.full(len(states), 1 / len(states))
+    unique, counts = np.unique(states, return_counts=True)
+    return unique, counts / len(states)
+
+
+def _all_actions(policy: Any, states: np.ndarray, visits: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every action of every visited state, weighted by q(a|s) × visits; actions that q excludes are left out."""
+    weights = policy.probabilities(states) * visits[:, None]
+    rows, actions = np.nonzero(weights)
+    base_weights = weights[rows, actions]
+    return rows, actions, base_weights / np.sum(base_weights)
+
+
+def _estimate_q(
+    policy: Any,
+    steps: Transitions,
+    utilities: np.ndarray,
+    *,
+    key: jax.Array,
+    action_space: Space,
+    features: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    discount: float,
+    fixed_point_ridge: float,
+    projection_ridge: float,
+) -> QFunction:
+    """LSTD-Q with a bias column, from every observed transition."""
+    steps, utilities, counts = _counted(steps, utilities)
+    current = _with_bias(features(steps.states, steps.actions))
+    if is_discrete(policy):
+        following = _expected_features(policy, steps.next_states, features)
+    else:
+        following = features(steps.next_states, clipped(sample_actions(policy, key, steps.next_states), action_space))
+    following = _with_bias(following)
+    following[steps.terminal] = 0.0
+    repeats = np.sqrt(counts)[:, None]  # a row times √n enters every Gram matrix as n rows
+    weights = lstd_q(
+        current * repeats,
+        following * repeats,
+        utilities * repeats[:, 0],
+        discount=discount,
+        fixed_point_ridge=fixed_point_ridge,
+        projection_ridge=projection_ridge,
+    )
+    return QFunction(features, weights)
+
+
+def _counted(steps: Transitions, utilities: np.ndarray) -> tuple[Transitions, np.ndarray, np.ndarray]:
+    """Discrete transitions once each, with the mean of their utilities and how often they occurred."""
+    if steps.states.ndim > 1 or steps.actions.ndim > 1:
+        return steps, utilities, np.ones(len(steps))
+    table = np.column_stack([steps.states, steps.actions, steps.next_states, steps.terminal])
+    _, first, inverse, counts = np.unique(table, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    means = np.bincount(inverse.ravel(), weights=utilities) / counts
+    unique = Transitions(
+        steps.states[first], steps.actions[first], steps.next_states[first], steps.rewards[first], steps.terminal[first]
+    )
+    return unique, means, counts.astype(float)
+
+
+def _expected_features(
+    policy: Any, states: np.ndarray, features: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Σₐ π(a|s)φ(s, a). Decision: where actions can be enumerated, their expectation replaces one fresh sample."""
+    probabilities = policy.probabilities(states)
+    total = probabilities[:, :1] * features(states, np.zeros(len(states), dtype=np.int64))
+    for action in range(1, probabilities.shape[1]):
+        total += probabilities[:, action, None] * features(states, np.full(len(states), action))
+    return total
+
+
+def _with_bias(features: np.ndarray) -> np.ndarray:
+    return np.column_stack([features, np.ones(len(features))])

@@ -1,0 +1,32 @@
+"""Which kind of policy suits an environment's spaces."""
+
+from typing import Any
+
+from gymnasium import Space
+from gymnasium.spaces import Box, Discrete
+
+from bayespbrl.policies.tabular import TabularPolicy
+
+
+def initial_policy(
+    kind: str, observation_space: Space, action_space: Space, *, action_scale: float = 0.75, period: Any = None
+) -> Any:
+    """The first policy of a run.
+
+    Args:
+      kind: `tabular`, `softmax`, `linear-gaussian`, `gaussian-process`, or `auto`: tabular for discrete states and
+        actions, softmax for discrete actions in continuous states, gaussian-process for continuous actions.
+      action_scale: standard deviation of a continuous policy, in ranges of the action space.
+      period: of each observation dimension, infinite where not periodic; None for none.
+
+    Raises:
+      ValueError: a kind there is not, or spaces that it does not suit.
+    """
+    if kind == "auto":
+        if isinstance(action_space, Box):
+            kind = "gaussian-process"
+        else:
+            kind = "tabular" if isinstance(observation_space, Discrete) else "softmax"
+    if kind == "tabular":
+        return TabularPolicy.initial(observation_space, action_space)
+    raise ValueError(f"policy: expected tabular, got {kind!r}")

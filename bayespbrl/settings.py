@@ -1,0 +1,119 @@
+"""What a run was asked to do, as plain data: the options of a learner, checked, with a preset for each domain."""
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+UTILITIES = ("posterior-mean", "most-likely", "linear-program", "known-reward")
+LIKELIHOODS = ("mixed", "logistic", "probit")
+POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of one run; names follow the paper and the command line.
+
+    Attributes:
+      env: a short name, a gymnasium id, or how an environment object describes itself.
+      utility: how step 1 estimates the utility; `known-reward` is the ceiling: the hidden reward itself.
+      iterations: cycles of the four steps.
+      kl_bound: ε of eq. 11, nats.
+      likelihood: of an answer given the margin; `mixed` is eq. 8.
+      prior_scale: σ, the prior's standard deviation of each utility weight.
+      steepness: m of the likelihood, for differences divided by their largest absolute entry.
+      lapse_rate: λ, the probability that an answer is a coin toss, in [0, 1).
+      seed: of every random choice of the run.
+      trajectories_per_iteration: N.
+      queries_per_iteration, first_queries: M, in later iterations and in the first.
+      discount: γ.
+      policy: the kind of policy; `auto` takes tabular for discrete states, softmax for discrete actions in continuous
+        states, gaussian-process otherwise.
+      evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
+      max_steps: steps an episode; None for the environment's own limit.
+      centres: radial basis functions of each kind of feature.
+      bandwidth_factor: multiplies the median rule for the features of Q and V.
+      initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
+      fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂.
+    """
+
+    env: str
+    utility: str = "posterior-mean"
+    iterations: int = 25
+    kl_bound: float = 0.3
+    likelihood: str = "mixed"
+    prior_scale: float = 1.0
+    steepness: float = 5.0
+    lapse_rate: float = 0.0
+    seed: int = 0
+    trajectories_per_iteration: int = 10
+    queries_per_iteration: int = 1
+    first_queries: int = 2
+    discount: float = 0.98
+    policy: str = "auto"
+    evaluation_episodes: int = 100
+    max_steps: int | None = None
+    centres: int = 300
+    bandwidth_factor: float = 1.0
+    initial_action_scale: float = 0.75
+    fixed_point_ridge: float = 1e-8
+    projection_ridge: float = 1e-8
+
+    def __post_init__(self) -> None:
+        _one_of("utility", self.utility, UTILITIES)
+        _one_of("likelihood", self.likelihood, LIKELIHOODS)
+        _one_of("policy", self.policy, POLICIES)
+        for name in ("kl_bound", "prior_scale", "steepness", "bandwidth_factor", "initial_action_scale"):
+            _number(name, getattr(self, name), lambda value: value > 0, "a positive finite number")
+        for name in ("fixed_point_ridge", "projection_ridge"):
+            _number(name, getattr(self, name), lambda value: value >= 0, "a non-negative finite number")
+        for name in ("lapse_rate", "discount"):
+            _number(name, getattr(self, name), lambda value: 0 <= value < 1, "a number in [0, 1)")
+        for name in ("iterations", "queries_per_iteration", "first_queries", "evaluation_episodes", "centres"):
+            _whole(name, getattr(self, name), 1)
+        _whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
+        _whole("seed", self.seed, 0)
+        if self.max_steps is not None:
+            _whole("max_steps", self.max_steps, 1)
+        for name, limit in (
+            ("queries_per_iteration", self.trajectories_per_iteration),
+            ("first_queries", self.trajectories_per_iteration - 1),
+        ):
+            if getattr(self, name) > limit:
+                raise ValueError(f"{name}: expected at most {limit} with {limit} candidates, got {getattr(self, name)}")
+
+
+def _one_of(name: str, value: object, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def _number(name: str, value: Any, holds: Any, expected: str) -> None:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if not (number and holds(value)):
+        raise ValueError(f"{name}: expected {expected}, got {value!r}")
+
+
+def _whole(name: str, value: Any, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"{name}: expected a whole number >= {least}, got {value!r}")
+
+
+# One row a domain: what differs from the defaults above, with the evidence for each number. Ten trajectories an iteration and the
+# paper's number of answers are the protocol and not for tuning.
+PRESETS: dict[str, dict[str, Any]] = {
+    "gridworld": {"iterations": 25},
+}
+
+
+def settings_for(env: str, **changes: Any) -> Settings:
+    """The preset of a domain (the defaults, for an environment without one) with `changes`; None changes nothing.
+
+    Raises:
+      ValueError: an option there is not, or a value that `Settings` does not take.
+    """
+    known = {field.name for field in fields(Settings)}
+    unknown = sorted(set(changes) - known)
+    if unknown:
+        raise ValueError(f"settings: expected options among {', '.join(sorted(known))}, got {', '.join(unknown)}")
+    chosen = {name: value for name, value in changes.items() if value is not None}
+    return replace(Settings(env), **(PRESETS.get(env, {}) | chosen))

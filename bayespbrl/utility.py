@@ -1,0 +1,154 @@
+"""Step 1: from preferences to an estimate of the expert's utility (paper, "Preference-based Inverse RL")."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from xarray import DataTree
+
+from bayespbrl.models import linear_program, sample_posterior
+from bayespbrl.preferences import pair_differences
+from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
+
+StateFeatures = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """How far an estimate can be trusted.
+
+    Attributes:
+      converged: the sampler's R̂ and effective sample size, or the linear program's status, are in order.
+      status: in words.
+      rhat_max, effective_sample_size_min: the worst over the margins (nan where there are no draws).
+      pairs, pairs_satisfied: K, and how many of the ordered pairs have a positive margin (eq. 6).
+      log_evidence: log marginal likelihood of the answers (nan where there is no posterior).
+    """
+
+    converged: bool
+    status: str
+    pairs: int
+    pairs_satisfied: int
+    rhat_max: float = float("nan")
+    effective_sample_size_min: float = float("nan")
+    log_evidence: float = float("nan")
+
+
+class UtilityEstimate(Protocol):
+    """What steps 2 and 4 ask of an estimate."""
+
+    quality: FitQuality
+
+    def step_utilities(self, steps: Transitions) -> np.ndarray:
+        """uᵢ of each transition, shape (N,)."""
+        ...
+
+    def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> np.ndarray:
+        """wᵀψ(τ) of each trajectory, shape (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class LinearUtility:
+    """u(s′) = wᵀφ(s′).
+
+    Attributes:
+      features: φ.
+      weights: w in the units of φ, shape (D,).
+      discount: γ of ψ(τ).
+      quality: how far it can be trusted.
+      posterior: draws in ArviZ's schema; None for the linear program.
+    """
+
+    features: StateFeatures
+    weights: np.ndarray
+    discount: float
+    quality: FitQuality
+    posterior: DataTree | None = None
+
+    def utilities(self, states: np.ndarray) -> np.ndarray:
+        """wᵀφ(s) of N states, shape (N,)."""
+        return self.features(states) @ self.weights
+
+    def step_utilities(self, steps: Transitions) -> np.ndarray:
+        """uᵢ = wᵀφ(sᵢ′): the utility of the *next* state, the same convention as in ψ."""
+        return self.utilities(steps.next_states)
+
+    def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> np.ndarray:
+        return trajectory_features(trajectories, self.features, discount=self.discount) @ self.weights
+
+
+@dataclass(frozen=True)
+class KnownReward:
+    """The environment's own reward in place of an estimate: the ceiling of every preference method."""
+
+    quality: FitQuality
+
+    def step_utilities(self, steps: Transitions) -> np.ndarray:
+        return steps.rewards
+
+    def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> np.ndarray:
+        return np.array([trajectory.total_reward for trajectory in trajectories])
+
+
+def estimate_utility(
+    trajectories: Sequence[Trajectory],
+    pairs: Sequence[tuple[int, int]],
+    features: StateFeatures,
+    *,
+    method: str,
+    discount: float,
+    prior_scale: float = 1.0,
+    steepness: float = 5.0,
+    lapse_rate: float = 0.0,
+    likelihood: str = "mixed",
+    seed: int = 0,
+) -> LinearUtility | KnownReward:
+    """The utility that explains the answers.
+
+    Decision: the differences ψ(preferred) − ψ(dominated) are divided once by their largest absolute entry before
+    `prior_scale` and `steepness` apply; the weights come back in the units of the features.
+
+    Args:
+      trajectories: n of them.
+      pairs: K ordered pairs (preferred, dominated) of their numbers.
+      features: φ, (N, S) states to (N, D).
+      method: `posterior-mean`, `most-likely`, `linear-program` or `known-reward`.
+      discount: γ of ψ.
+      prior_scale, steepness, lapse_rate, likelihood: of the posterior.
+      seed: of the sampler.
+
+    Source: paper, eqs. 5-10.
+    """
+    if method == "known-reward":
+        returns = np.array([trajectory.total_reward for trajectory in trajectories])
+        satisfied = sum(bool(returns[i] > returns[j]) for i, j in pairs)
+        return KnownReward(FitQuality(True, "known reward", len(pairs), satisfied))
+    differences = pair_differences(pairs, trajectory_features(trajectories, features, discount=discount))
+    scale = float(np.max(np.abs(differences), initial=0.0)) or 1.0
+    if method == "linear-program":
+        program = linear_program(differences / scale)
+        satisfied = int(np.sum(differences @ program.weights > 0))
+        quality = FitQuality(program.converged, program.status, len(pairs), satisfied)
+        return LinearUtility(features, program.weights / scale, discount, quality)
+    tree = sample_posterior(
+        differences / scale,
+        prior_scale=prior_scale,
+        steepness=steepness,
+        lapse_rate=lapse_rate,
+        likelihood=likelihood,
+        seed=seed,
+    )
+    name = {"posterior-mean": "utility_weights_mean", "most-likely": "utility_weights_most_likely"}[method]
+    weights = np.asarray(tree[name]) / scale
+    quality = FitQuality(
+        converged=bool(tree.attrs["converged"]),
+        status="converged" if tree.attrs["converged"] else "the sampler did not converge within its cap of draws",
+        pairs=len(pairs),
+        pairs_satisfied=int(np.sum(differences @ weights > 0)),
+        rhat_max=float(tree.attrs["rhat_max"]),
+        effective_sample_size_min=float(tree.attrs["effective_sample_size_min"]),
+        log_evidence=float(tree.attrs["log_evidence"]),
+    )
+    return LinearUtility(features, weights, discount, quality, tree)
