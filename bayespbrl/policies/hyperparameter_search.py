@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 from cmaes import CMA
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from bayespbrl.kernels import coordinates, inverse_bandwidths, squared_exponential
 from bayespbrl.policies.sparse_regression import inducing_rows, precisions, whitened_correlations
@@ -170,8 +169,8 @@ def _predict(
     signal, noise = parameters.signal_variance, parameters.noise_variance
     seen, new = whitened[:, train], whitened[:, test]
     scaled = seen * precisions(seen, weights[train], signal_variance=signal, noise_variance=noise)
-    factor = cho_factor(np.eye(len(seen)) + signal * (scaled @ seen.T), lower=True, check_finite=False)
-    mean = signal * (new.T @ cho_solve(factor, scaled @ targets[train], check_finite=False))
-    left = solve_triangular(factor[0], new, lower=True, check_finite=False)
+    inverse_lower = np.linalg.inv(np.linalg.cholesky(np.eye(len(seen)) + signal * (scaled @ seen.T)))
+    left = inverse_lower @ new
+    mean = signal * (left.T @ (inverse_lower @ (scaled @ targets[train])))
     unexplained = np.maximum(1.0 - np.einsum("mn,mn->n", new, new), 0.0)
     return mean, signal * (unexplained + np.einsum("mn,mn->n", left, left)) + noise
