@@ -1,0 +1,40 @@
+"""A film strip: the poses of a trajectory side by side on one pair of axes."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+COLUMNS = 10
+MAX_POSES = 30
+
+
+def draw_pose(lines: Sequence[np.ndarray], axes: Any, *, offset: Any = (0.0, 0.0), width: float = 6.0) -> None:
+    """Connected limbs: each of `lines` is an (n, 2) polyline, drawn with a joint at its first point."""
+    for number, line in enumerate(lines):
+        x, y = (np.asarray(line) + offset).T
+        axes.plot(x, y, color=f"C{number}", linewidth=width, solid_capstyle="round")
+        axes.plot(x[:1], y[:1], "o", color="0.2", markersize=width)
+
+
+def draw_film_strip(
+    pose: Callable[[Any], Sequence[np.ndarray]], states: np.ndarray, axes: Any, *, step_seconds: float
+) -> None:
+    """At most 30 poses, first and last among them, ten a row, each with its time.
+
+    Args:
+      pose: the polylines of one observation, in the square [−1, 1]².
+      states: observations, shape (T+1, S).
+      axes: matplotlib axes.
+      step_seconds: duration of a step.
+    """
+    shown = np.unique(np.linspace(0, len(states) - 1, MAX_POSES).round().astype(int))
+    for place, index in enumerate(shown):
+        row, column = divmod(place, COLUMNS)
+        offset = np.array([2.3 * column, -2.8 * row])
+        draw_pose(pose(states[index]), axes, offset=offset, width=2.5)
+        axes.text(offset[0], offset[1] - 1.35, f"{index * step_seconds:.2f} s", ha="center", va="center", fontsize=7)
+    rows = -(-len(shown) // COLUMNS)
+    axes.set(
+        xlim=(-1.2, 2.3 * COLUMNS - 1.1), ylim=(-2.8 * (rows - 1) - 1.6, 1.2), aspect="equal", xticks=[], yticks=[]
+    )
