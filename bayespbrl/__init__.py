@@ -1,1 +1,24 @@
 """Probabilistic programming for preference-based reinforcement learning."""
+
+from bayespbrl.cycle import Learner
+from bayespbrl.experts import NoisyExpert, ReturnExpert, TerminalExpert
+from bayespbrl.preferences import Answer, Preferences, Query
+from bayespbrl.runs import Run, load, resume, start
+from bayespbrl.settings import Settings
+from bayespbrl.trajectories import Trajectory
+
+__all__ = [
+    "Answer",
+    "Learner",
+    "NoisyExpert",
+    "Preferences",
+    "Query",
+    "ReturnExpert",
+    "Run",
+    "Settings",
+    "TerminalExpert",
+    "Trajectory",
+    "load",
+    "resume",
+    "start",
+]

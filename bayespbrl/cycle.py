@@ -30,8 +30,7 @@ class Learner:
     Args:
       env: a short name (`gridworld`, …), a gymnasium id, or an environment.
       features: φ of your own, from observations (N, S) to (N, D); drawn by the settings when None.
-      policy: a first policy of your own; chosen by the settings when None.
-      log: where events go; None keeps no record beyond the state.
+      policy: a kind of policy by name, as of `Settings`, or a first policy of your own.
       entries: events of a run to continue.
       **settings: options of `Settings`, over the preset of the environment.
 
@@ -45,23 +44,32 @@ class Learner:
         *,
         features: utility.StateFeatures | None = None,
         policy: Any = None,
-        log: Log | None = None,
         entries: Iterable[Entry] = (),
         **settings: Any,
     ):
         self.environment = rollouts.open_environment(env)
-        self.settings: Settings = settings_for(env if isinstance(env, str) else environment_name(env), **settings)
+        own_policy = None if policy is None or isinstance(policy, str) else policy
+        self.settings: Settings = settings_for(
+            env if isinstance(env, str) else environment_name(self.environment),
+            policy=policy if own_policy is None else "other",
+            **settings,
+        )
         self.features = features
-        self._log = log
-        if policy is None:
-            policy = initial_policy(
+        self._log: Log | None = None
+        if own_policy is None:
+            own_policy = initial_policy(
                 self.settings.policy,
                 self.environment.observation_space,
                 self.environment.action_space,
                 action_scale=self.settings.initial_action_scale,
                 period=self._period,
             )
-        self.state = events.replay(LearnerState(policy), entries)
+        self.state = events.replay(LearnerState(own_policy), entries)
+
+    def logged(self, log: Log) -> "Learner":
+        """The same learner, which from now on appends what happens to `log`."""
+        self._log = log
+        return self
 
     # What a user reads off.
 
@@ -100,7 +108,7 @@ class Learner:
         Each new trajectory is compared with the best of all before it, so there is one question at a time.
         """
         self._advance()
-        return [] if self.state.query is None else [self.state.query]
+        return self._waiting()
 
     def tell(self, answers: Sequence[Answer | str]) -> None:
         """Take in the answer to the question that waits, and move on as far as possible without another.
@@ -108,15 +116,14 @@ class Learner:
         Raises:
           ValueError: an answer that is none, or not as many answers as questions; nothing has happened then.
         """
-        waiting = 0 if self.state.query is None else 1
-        if isinstance(answers, str) or len(answers) != waiting:
-            raise ValueError(f"tell: expected {waiting} answers in a list, got {answers!r}")
-        for answer in map(parse_answer, answers):
+        waiting = self._waiting()
+        if isinstance(answers, str) or len(answers) != len(waiting):
+            raise ValueError(f"tell: expected a list of {len(waiting)} answers, one a question, got {answers!r}")
+        for query, answer in zip(waiting, map(parse_answer, answers), strict=True):
             if answer is Answer.UNDO:
                 self.undo()
             else:
-                assert_query = self.state.query
-                self._record({"event": "answered", "query": assert_query.number, "answer": str(answer)})
+                self._record({"event": "answered", "query": query.number, "answer": str(answer)})
         self._advance()
 
     def undo(self) -> None:
@@ -142,6 +149,9 @@ class Learner:
             if progress is not None:
                 progress(self)
         return self
+
+    def _waiting(self) -> list[Query]:
+        return [] if self.state.query is None else [self.state.query]
 
     # The four steps.
 
@@ -285,10 +295,10 @@ class Learner:
 
     def _record(self, event: dict[str, Any], **parts: Any) -> None:
         """Append to the log first, then move on: what the learner knows is never ahead of what is kept."""
-        entry = Entry(event, parts)
+        entry = Entry(events.plain(event), parts)
         state = events.apply(self.state, entry)
         if self._log is not None:
-            self._log.append(entry)
+            self._log.append(entry, state)
         self.state = state
 
     def _rng(self, purpose: int, count: int) -> np.random.Generator:

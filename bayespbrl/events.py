@@ -9,9 +9,12 @@ Resume, undo, a person who answers next week and a report on a run in progress a
 * `undone`: the last answer was taken back, and everything that followed from it.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
+
+import numpy as np
 
 from bayespbrl.preferences import Answer, Preferences, Query
 from bayespbrl.trajectories import Trajectory
@@ -31,9 +34,9 @@ class Entry:
 
 
 class Log(Protocol):
-    """Where entries go before the learner moves on."""
+    """Where entries go before the learner moves on, with the state that each leads to."""
 
-    def append(self, entry: Entry) -> None: ...
+    def append(self, entry: Entry, state: "LearnerState") -> None: ...
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class LearnerState:
     estimate: Any = None
     iteration: int = 0
     trajectories: tuple[Trajectory, ...] = ()
-    preferences: Preferences = Preferences()
+    preferences: Preferences = field(default_factory=Preferences)
     collected: bool = False
     candidates: tuple[int, ...] = ()
     wanted: int = 0
@@ -140,3 +143,14 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]
     preferences = state.preferences.add(query.newcomer, query.incumbent, preferred=preferred)
     return replace(after, preferences=preferences, wanted=state.wanted - 1)
+
+
+def plain(value: Any) -> Any:
+    """An event as it will be read back from JSON: NumPy numbers as Python's, what is not finite as None."""
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -6,7 +6,8 @@ from typing import Any
 
 UTILITIES = ("posterior-mean", "most-likely", "linear-program", "known-reward")
 LIKELIHOODS = ("mixed", "logistic", "probit")
-POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process")
+EXPERTS = ("return", "terminal", "other")
+POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,15 @@ class Settings:
       queries_per_iteration, first_queries: M, in later iterations and in the first.
       discount: γ.
       policy: the kind of policy; `auto` takes tabular for discrete states, softmax for discrete actions in continuous
-        states, gaussian-process otherwise.
+        states, gaussian-process otherwise; `other` stands for a policy of the user's.
       evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
       max_steps: steps an episode; None for the environment's own limit.
       centres: radial basis functions of each kind of feature.
       bandwidth_factor: multiplies the median rule for the features of Q and V.
       initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
       fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂.
+      expert, wrong_answers: who answers, and the share of a simulated expert's answers that are turned round; kept so
+        that a stopped run finds its expert again.
     """
 
     env: str
@@ -57,6 +60,8 @@ class Settings:
     initial_action_scale: float = 0.75
     fixed_point_ridge: float = 1e-8
     projection_ridge: float = 1e-8
+    expert: str = "return"
+    wrong_answers: float = 0.0
 
     def __post_init__(self) -> None:
         _one_of("utility", self.utility, UTILITIES)
@@ -66,6 +71,8 @@ class Settings:
             _number(name, getattr(self, name), lambda value: value > 0, "a positive finite number")
         for name in ("fixed_point_ridge", "projection_ridge"):
             _number(name, getattr(self, name), lambda value: value >= 0, "a non-negative finite number")
+        _one_of("expert", self.expert, EXPERTS)
+        _number("wrong_answers", self.wrong_answers, lambda value: 0 <= value <= 1, "a share in [0, 1]")
         for name in ("lapse_rate", "discount"):
             _number(name, getattr(self, name), lambda value: 0 <= value < 1, "a number in [0, 1)")
         for name in ("iterations", "queries_per_iteration", "first_queries", "evaluation_episodes", "centres"):
@@ -98,8 +105,8 @@ def _whole(name: str, value: Any, least: int) -> None:
         raise ValueError(f"{name}: expected a whole number >= {least}, got {value!r}")
 
 
-# One row a domain: what differs from the defaults above, with the evidence for each number. Ten trajectories an iteration and the
-# paper's number of answers are the protocol and not for tuning.
+# One row a domain: what differs from the defaults above, with the evidence for each number. Ten trajectories an
+# iteration and the paper's number of answers are the protocol and not for tuning.
 PRESETS: dict[str, dict[str, Any]] = {
     "gridworld": {"iterations": 25},
 }

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectory:
     """One trajectory of T steps.
 
@@ -37,6 +37,9 @@ class Trajectory:
         for name in ("states", "actions", "rewards"):
             if not np.all(np.isfinite(getattr(self, name))):
                 raise ValueError(f"trajectory: {name} must be finite, got NaN or infinity")
+
+    def __repr__(self) -> str:
+        return f"Trajectory(steps={len(self)}, terminated={self.terminated})"
 
     def __len__(self) -> int:
         """Number of steps T."""

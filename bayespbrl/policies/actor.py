@@ -1,0 +1,38 @@
+"""A policy put to work: one observation in, one action for the environment out."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Box
+
+from bayespbrl.policies.batch import sample_actions
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A stochastic policy and the action space whose bounds its actions keep.
+
+    Attributes:
+      policy: any `Policy`.
+      action_space: of the environment.
+      rng: where a call without a key draws from.
+    """
+
+    policy: Any
+    action_space: Space
+    rng: np.random.Generator
+
+    def act(self, observation: Any, *, key: jax.Array | None = None) -> Any:
+        """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete."""
+        if key is None:
+            key = jax.random.key(int(self.rng.integers(2**31)))
+        dtype = np.int64 if np.ndim(observation) == 0 else np.float64
+        action = sample_actions(self.policy, key, np.asarray(observation, dtype=dtype)[None])[0]
+        if isinstance(self.action_space, Box):
+            return np.clip(action, self.action_space.low, self.action_space.high).astype(self.action_space.dtype)
+        return int(action)
+
+    __call__ = act

@@ -1,0 +1,81 @@
+"""Frozen dataclasses of arrays and numbers as xarray trees, and back: how policies, features and estimates are stored.
+
+Arrays become variables, everything else becomes one JSON attribute, dataclasses within become groups. No pickle: what
+is read back are arrays and numbers, put into a class that is ours or that the caller named.
+"""
+
+import dataclasses
+import importlib
+import json
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+OURS = "bayespbrl."
+
+
+def to_tree(record: Any) -> xr.DataTree:
+    """A dataclass instance as a tree.
+
+    Raises:
+      ValueError: something that is no dataclass, or a field that is no array, number, text, None or dataclass.
+    """
+    if not dataclasses.is_dataclass(record) or isinstance(record, type):
+        raise ValueError(f"record: expected a dataclass to store, got {type(record).__name__}")
+    arrays, plain, children = {}, {}, {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, np.ndarray | jax.Array):
+            array = np.asarray(value)
+            arrays[field.name] = ([f"{field.name}_{axis}" for axis in range(array.ndim)], array)
+        elif dataclasses.is_dataclass(value):
+            children[field.name] = to_tree(value)
+        elif value is None or isinstance(value, bool | int | float | str | tuple | np.generic):
+            plain[field.name] = value.item() if isinstance(value, np.generic) else value
+        else:
+            kind = type(value).__name__
+            raise ValueError(f"record: {type(record).__name__}.{field.name} is a {kind}, which cannot be stored")
+    attributes = {"class": f"{type(record).__module__}:{type(record).__qualname__}", "fields": json.dumps(plain)}
+    return xr.DataTree(xr.Dataset(arrays, attrs=attributes), children=children)
+
+
+def from_tree(tree: xr.DataTree, *, known: Iterable[type] = ()) -> Any:
+    """The dataclass instance that `to_tree` made the tree from.
+
+    Args:
+      tree: loaded into memory.
+      known: classes outside this package that may be made.
+
+    Raises:
+      ValueError: a class that is neither ours nor known, or fields that it does not take.
+    """
+    kind = _class(str(tree.attrs.get("class", "")), tuple(known))
+    fields = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in json.loads(tree.attrs["fields"]).items()
+    }
+    arrays = {str(name): variable.values for name, variable in tree.data_vars.items()}
+    children = {name: from_tree(child, known=known) for name, child in tree.children.items()}
+    try:
+        return kind(**fields, **arrays, **children)
+    except TypeError as error:
+        raise ValueError(f"record: stored {kind.__name__} does not fit this version's ({error})") from error
+
+
+def _class(name: str, known: tuple[type, ...]) -> type:
+    for candidate in known:
+        if name == f"{candidate.__module__}:{candidate.__qualname__}":
+            return candidate
+    module, _, qualified = name.partition(":")
+    if not module.startswith(OURS):
+        raise ValueError(f"record: expected a class of {OURS[:-1]} or one that was passed again, got {name!r}")
+    try:
+        kind = getattr(importlib.import_module(module), qualified)
+    except (ImportError, AttributeError):
+        raise ValueError(f"record: expected a class of this version, got {name!r}") from None
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise ValueError(f"record: expected a dataclass, got {name!r}")
+    return kind
