@@ -1,0 +1,236 @@
+"""Features: one-hot, radial basis functions, their products with actions, and the checks of a user's own."""
+
+import time
+from dataclasses import fields, is_dataclass
+
+import jax
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+
+from bayespbrl.features import (
+    JointRadialBasis,
+    OneHot,
+    RadialBasis,
+    StateActionProduct,
+    checked_features,
+    draw_state_action_features,
+    draw_state_features,
+)
+from bayespbrl.kernels import median_bandwidths, radial_basis_row
+
+PERIOD = (2 * np.pi, np.inf)
+STATES = Box(-np.inf, np.inf, (2,))
+TORQUE = Box(-30.0, 30.0, (1,))
+
+
+def swinging_states(number, rng):
+    return np.column_stack([rng.uniform(-np.pi, np.pi, number), 5 * rng.normal(size=number) + 3])
+
+
+def test_one_hot_marks_the_state():
+    np.testing.assert_array_equal(OneHot(3)(np.array([2, 0])), [[0, 0, 1], [1, 0, 0]])
+
+
+def test_one_hot_of_state_and_action_numbers_the_actions_within_a_state():
+    features = StateActionProduct(OneHot(2), 3)(np.array([0, 1]), np.array([2, 1]))
+    np.testing.assert_array_equal(features, [[0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0]])
+
+
+def test_radial_basis_is_the_gaussian_of_the_scaled_distance():
+    features = RadialBasis(np.array([[1.0, -2.0], [4.0, 0.0]]), np.array([2.0, 0.5]), np.array([np.inf, np.inf]))
+    # first centre: (2/2)² + (1/0.5)² = 5; second: (−1/2)² + (−1/0.5)² = 4.25
+    np.testing.assert_allclose(features(np.array([[3.0, -1.0]])), np.exp([[-2.5, -2.125]]), rtol=1e-14)
+
+
+def test_periodic_kernel_is_the_kernel_over_cosine_and_sine():
+    rng = np.random.default_rng(0)
+    points, centres = rng.uniform(-9, 9, (40, 1)), rng.uniform(-9, 9, (7, 1))
+    periodic = RadialBasis(centres, np.array([0.4]), np.array([2 * np.pi]))(points)
+
+    def circle(x):
+        return np.hstack([np.cos(x), np.sin(x)])
+
+    plain = RadialBasis(circle(centres), np.array([0.4, 0.4]), np.array([np.inf, np.inf]))(circle(points))
+    np.testing.assert_allclose(periodic, plain, atol=1e-14)
+    np.testing.assert_allclose(
+        periodic, RadialBasis(centres, np.array([0.4]), np.array([2 * np.pi]))(points + 4 * np.pi)
+    )
+
+
+def test_a_long_period_is_no_period():
+    points, centres = np.array([[0.3], [2.0]]), np.array([[-0.5], [0.7]])
+    long = RadialBasis(centres, np.array([0.8]), np.array([1e4]))(points)
+    np.testing.assert_allclose(long, RadialBasis(centres, np.array([0.8]), np.array([np.inf]))(points), rtol=1e-5)
+
+
+def test_matrix_product_loses_no_accuracy_far_from_the_origin():
+    rng = np.random.default_rng(1)
+    points, centres = 1e6 + rng.normal(size=(50, 3)), 1e6 + rng.normal(size=(9, 3))
+    bandwidths = np.array([0.5, 1.0, 2.0])
+    direct = np.exp(-0.5 * (np.square(points[:, None] - centres) / bandwidths**2).sum(axis=2))
+    np.testing.assert_allclose(RadialBasis(centres, bandwidths, np.full(3, np.inf))(points), direct, rtol=1e-12)
+
+
+def test_the_traceable_row_equals_the_matrix():
+    rng = np.random.default_rng(2)
+    points, centres, bandwidths = swinging_states(30, rng), swinging_states(11, rng), np.array([0.7, 0.0])
+    with jax.enable_x64(True):
+        rows = jax.vmap(lambda x: radial_basis_row(x, centres, bandwidths, np.array(PERIOD)))(points)
+    np.testing.assert_allclose(rows, RadialBasis(centres, bandwidths, np.array(PERIOD))(points), rtol=1e-12)
+
+
+def test_a_constant_dimension_is_left_out():
+    rng = np.random.default_rng(3)
+    states = np.column_stack([rng.normal(size=200), np.full(200, 7.0)])
+    features = draw_state_features(STATES, states, rng=rng, number_of_centres=20)
+    assert features.bandwidths[1] == 0.0
+    moved = states + np.array([0.0, 1.0])
+    np.testing.assert_array_equal(features(states), features(moved))
+    assert np.ptp(features(states)) > 0.5
+
+
+def test_median_rule_is_the_median_over_all_pairs():
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(200, 1)) * 3 + 10
+    exact = np.sqrt(np.median(np.square(points - points.T)[np.triu_indices(200, 1)]))
+    estimate = median_bandwidths(points, factor=0.5, rng=rng, number_of_pairs=200_000)
+    np.testing.assert_allclose(estimate, 0.5 * exact, rtol=0.01)
+
+
+def test_median_rule_wraps_periodic_differences():
+    points = np.array([[-np.pi + 0.1], [np.pi - 0.1]])
+    wrapped = median_bandwidths(points, period=(2 * np.pi,), rng=np.random.default_rng(0))
+    np.testing.assert_allclose(wrapped, 0.2)
+
+
+def test_median_rule_of_a_mostly_constant_dimension_is_not_zero():
+    points = np.zeros((1000, 1))
+    points[:50] = 1.0
+    assert median_bandwidths(points, rng=np.random.default_rng(0))[0] == pytest.approx(
+        np.sqrt(2 * 0.05 * 0.95), rel=0.2
+    )
+
+
+def test_centres_are_observed_states_without_repetition():
+    rng = np.random.default_rng(5)
+    states = swinging_states(100, rng)
+    features = draw_state_features(STATES, states, rng=rng, number_of_centres=60, period=PERIOD)
+    assert len(np.unique(features.centres, axis=0)) == 60
+    assert {tuple(c) for c in features.centres} <= {tuple(s) for s in states}
+    assert draw_state_features(STATES, states, rng=rng, number_of_centres=700).centres.shape == (100, 2)
+
+
+def test_the_same_generator_draws_the_same_features():
+    states = swinging_states(100, np.random.default_rng(6))
+    one, two = (
+        draw_state_features(STATES, states, rng=np.random.default_rng(7), number_of_centres=9)(states) for _ in "ab"
+    )
+    np.testing.assert_array_equal(one, two)
+
+
+def test_joint_features_are_the_product_of_a_state_and_an_action_kernel():
+    rng = np.random.default_rng(8)
+    states, actions = swinging_states(300, rng), rng.uniform(-30, 30, (300, 1))
+    joint = draw_state_action_features(
+        STATES, TORQUE, states, actions, rng=rng, number_of_centres=25, action_bandwidth=0.25, period=PERIOD
+    )
+    assert isinstance(joint, JointRadialBasis)
+    # 0.25 of the range of 60 is a bandwidth of 15
+    action_kernel = np.exp(-0.5 * np.square((actions - joint.action_centres.T) / 15))
+    np.testing.assert_allclose(joint(states, actions), joint.states(states) * action_kernel, rtol=1e-11)
+
+
+def test_joint_features_clip_actions_as_the_environment_does():
+    rng = np.random.default_rng(9)
+    states, actions = swinging_states(50, rng), 100 * rng.normal(size=(50, 1))
+    joint = draw_state_action_features(STATES, TORQUE, states, actions, rng=rng, number_of_centres=10)
+    assert np.abs(joint.action_centres).max() <= 30
+    np.testing.assert_array_equal(joint(states, actions), joint(states, np.clip(actions, -30, 30)))
+
+
+def test_joint_features_of_an_unbounded_action_follow_its_observed_spread():
+    rng = np.random.default_rng(10)
+    states, actions = swinging_states(500, rng), 7 * rng.normal(size=(500, 1))
+    joint = draw_state_action_features(
+        STATES, Box(-np.inf, np.inf, (1,)), states, actions, rng=rng, number_of_centres=10
+    )
+    assert joint.action_range[0] == pytest.approx(28, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("observation_space", "action_space"),
+    [(STATES, TORQUE), (STATES, Discrete(3)), (Discrete(6), Discrete(3))],
+)
+def test_features_are_dataclasses_of_arrays_and_numbers(observation_space, action_space):
+    rng = np.random.default_rng(11)
+    discrete = isinstance(observation_space, Discrete)
+    states = rng.integers(6, size=40) if discrete else swinging_states(40, rng)
+    actions = rng.integers(3, size=40) if isinstance(action_space, Discrete) else rng.normal(size=(40, 1))
+    features = draw_state_action_features(
+        observation_space, action_space, states, actions, rng=rng, number_of_centres=8
+    )
+    assert features(states, actions).shape == {"Box": (40, 8)}.get(
+        type(action_space).__name__, (40, 18 if discrete else 24)
+    )
+
+    def check(value):
+        if is_dataclass(value):
+            for field in fields(value):
+                check(getattr(value, field.name))
+        else:
+            assert isinstance(value, np.ndarray | int | float)
+
+    check(features)
+
+
+def test_seven_hundred_features_of_24000_states_are_quick():
+    rng = np.random.default_rng(12)
+    states = swinging_states(24_000, rng)
+    features = draw_state_features(STATES, states, rng=rng, number_of_centres=700, period=PERIOD)
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        features(states)
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 1.0  # 0.1 on two idle cores; the bound leaves room for a busy machine
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (lambda s: s[:, 0], r"<lambda>: expected shape \(5, D\), got \(5,\)"),
+        (lambda s: s[:3], r"expected shape \(5, D\), got \(3, 2\)"),
+        (lambda s: s / np.where(np.arange(5) == 3, np.nan, 1.0)[:, None], "NaN or infinity for state"),
+        (lambda s: s.astype(str), "expected real numbers"),
+        (lambda s: s[:, :0], r"got \(5, 0\)"),
+    ],
+)
+def test_bad_user_features_are_named(features, message):
+    with pytest.raises(ValueError, match=message):
+        checked_features(features, np.ones((5, 2)))
+
+
+def test_good_user_features_pass_as_float64():
+    values = checked_features(lambda s: s > 0, np.array([[1.0], [-1.0]]))
+    assert values.dtype == np.float64
+    np.testing.assert_array_equal(values, [[1], [0]])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: OneHot(3)(np.array([3])), "expected states in 0 … 2"),
+        (lambda r: OneHot(3)(np.array([0.5])), "expected integers"),
+        (lambda r: draw_state_features(STATES, np.ones((4, 3)), rng=r, number_of_centres=2), r"shape \(N, 2\)"),
+        (lambda r: draw_state_features(STATES, np.full((4, 2), np.nan), rng=r, number_of_centres=2), "NaN"),
+        (lambda r: draw_state_features(STATES, np.ones((4, 2)), rng=r, number_of_centres=0), "number_of_centres"),
+        (lambda r: draw_state_features(Box(0, 1, (2, 2)), np.ones((4, 2)), rng=r, number_of_centres=1), "Box of shape"),
+        (lambda r: median_bandwidths(np.ones((4, 2)), factor=0.0, rng=r), "factor"),
+        (lambda r: median_bandwidths(np.ones((4, 2)), period=(1.0,), rng=r), "period: expected 2"),
+        (lambda r: median_bandwidths(np.ones((4, 1)), period=(-1.0,), rng=r), "period: expected 1"),
+    ],
+)
+def test_bad_input_is_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(np.random.default_rng(0))
