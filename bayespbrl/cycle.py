@@ -55,7 +55,7 @@ class Learner:
             **settings,
         )
         self.features = features
-        self._log: Log | None = None
+        self.log: Log | None = None
         if own_policy is None:
             own_policy = initial_policy(
                 self.settings.policy,
@@ -68,7 +68,7 @@ class Learner:
 
     def logged(self, log: Log) -> "Learner":
         """The same learner, which from now on appends what happens to `log`."""
-        self._log = log
+        self.log = log
         return self
 
     # What a user reads off.
@@ -297,8 +297,8 @@ class Learner:
         """Append to the log first, then move on: what the learner knows is never ahead of what is kept."""
         entry = Entry(events.plain(event), parts)
         state = events.apply(self.state, entry)
-        if self._log is not None:
-            self._log.append(entry, state)
+        if self.log is not None:
+            self.log.append(entry, state)
         self.state = state
 
     def _rng(self, purpose: int, count: int) -> np.random.Generator:

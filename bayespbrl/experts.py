@@ -63,6 +63,11 @@ class NoisyExpert:
         return reversal.get(answer, answer) if wrong else answer
 
 
+def simulated_expert(wrong_answers: float = 0.0, *, seed: int = 0) -> Expert:
+    """`ReturnExpert`, or a `NoisyExpert` over it where some answers are to be wrong."""
+    return NoisyExpert(ReturnExpert(), wrong_answers, seed) if wrong_answers else ReturnExpert()
+
+
 PROMPT = "Which is better? [1] first  [2] second  [t] tie  [s] skip  [u] undo  [q] stop here: "
 KEYS = {"1": Answer.FIRST, "2": Answer.SECOND, "t": Answer.TIE, "s": Answer.SKIP, "u": Answer.UNDO}
 

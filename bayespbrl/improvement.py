@@ -102,10 +102,11 @@ def improve(
         rows, actions, base_weights = _all_actions(policy, states, visits)
     else:
         rows, base_weights = np.arange(len(states)), visits
-        actions = clipped(sample_actions(policy, fresh_key, states), action_space)
-    reps = reps_weights(
-        q_function(states[rows], actions), state_features(states)[rows], base_weights, kl_bound=kl_bound
-    )
+        actions = sample_actions(policy, fresh_key, states)
+    # Q is of the action that the environment would see; the fit is of the action that the policy drew, because
+    # fitting clipped ones would shrink the policy at every update
+    q_values = q_function(states[rows], clipped(actions, action_space))
+    reps = reps_weights(q_values, state_features(states)[rows], base_weights, kl_bound=kl_bound)
     fitted = policy.fit(states[rows], actions, reps.sample_weights, rng=rng, base_weights=base_weights)
     return Improvement(
         policy=fitted,

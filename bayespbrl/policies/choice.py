@@ -5,13 +5,17 @@ from typing import Any
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete
 
+from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
+from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
+from bayespbrl.policies.policy import Policy
+from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
 
 def initial_policy(
     kind: str, observation_space: Space, action_space: Space, *, action_scale: float = 0.75, period: Any = None
-) -> Any:
-    """The first policy of a run.
+) -> Policy:
+    """The first policy of a run: as random as the action space allows.
 
     Args:
       kind: `tabular`, `softmax`, `linear-gaussian`, `gaussian-process`, or `auto`: tabular for discrete states and
@@ -27,6 +31,17 @@ def initial_policy(
             kind = "gaussian-process"
         else:
             kind = "tabular" if isinstance(observation_space, Discrete) else "softmax"
-    if kind == "tabular":
-        return TabularPolicy.initial(observation_space, action_space)
-    raise ValueError(f"policy: expected tabular, got {kind!r}")
+    match kind:
+        case "tabular":
+            return TabularPolicy.initial(observation_space, action_space)
+        case "softmax":
+            return SoftmaxPolicy.initial(observation_space, action_space, period=period)
+        case "linear-gaussian":
+            return LinearGaussianPolicy.initial(observation_space, action_space, initial_scale=action_scale)
+        case "gaussian-process":
+            return GaussianProcessPolicy.initial(
+                observation_space, action_space, period=period, initial_scale=action_scale
+            )
+    raise ValueError(
+        f"policy: expected auto, tabular, softmax, linear-gaussian or gaussian-process to start from, got {kind!r}"
+    )

@@ -1,0 +1,5 @@
+"""`python -m bayespbrl` is `bayespbrl`."""
+
+from bayespbrl.cli import main
+
+main()

@@ -1,0 +1,264 @@
+"""The command line: `bayespbrl run`, `resume`, `trials`."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+app = typer.Typer(
+    help="Preference-based reinforcement learning: a policy from answers to 'which of these two is better?'.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+console = Console(soft_wrap=True)
+
+Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot, or any gymnasium id.")]
+Utility = Annotated[
+    str | None, typer.Option(help="posterior-mean, most-likely, linear-program or known-reward (the ceiling).")
+]
+Iterations = Annotated[int | None, typer.Option(help="Cycles of the four steps.")]
+KLBound = Annotated[float | None, typer.Option("--kl-bound", help="Bound on each policy update, in nats.")]
+Likelihood = Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or probit.")]
+PriorScale = Annotated[float | None, typer.Option(help="Prior standard deviation of a utility weight.")]
+Steepness = Annotated[float | None, typer.Option(help="Of the likelihood, in units of the largest difference.")]
+LapseRate = Annotated[float | None, typer.Option(help="Share of answers that the model takes for coin tosses.")]
+WrongAnswers = Annotated[float | None, typer.Option(help="Share of the simulated expert's answers turned round.")]
+PolicyKind = Annotated[
+    str | None, typer.Option("--policy", help="auto, tabular, softmax, linear-gaussian or gaussian-process.")
+]
+Centres = Annotated[int | None, typer.Option(help="Radial basis functions of each kind of feature.")]
+MaxSteps = Annotated[int | None, typer.Option(help="Steps an episode, where the environment sets no limit.")]
+Expert = Annotated[str | None, typer.Option(help="return (simulated) or terminal (you).")]
+
+
+@app.command()
+def run(
+    env: Env,
+    utility: Utility = None,
+    iterations: Iterations = None,
+    kl_bound: KLBound = None,
+    likelihood: Likelihood = None,
+    prior_scale: PriorScale = None,
+    steepness: Steepness = None,
+    lapse_rate: LapseRate = None,
+    wrong_answers: WrongAnswers = None,
+    policy: PolicyKind = None,
+    centres: Centres = None,
+    max_steps: MaxSteps = None,
+    expert: Expert = None,
+    seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Run directory; a fresh one under runs/ when left out.")] = None,
+) -> None:
+    """Learn a task from preferences and keep the run in a directory."""
+    from bayespbrl import runs
+
+    options = {name: value for name, value in locals().items() if name not in ("env", "seed", "out", "runs")}
+    _carry_on(runs.start(env, out, seed=seed, **options))
+
+
+@app.command()
+def resume(directory: Annotated[Path, typer.Argument(help="Directory of a run that was stopped.")]) -> None:
+    """Go on with a run where it stopped; no answer is asked for twice."""
+    from bayespbrl import runs
+
+    learner = runs.resume(directory)
+    if learner.finished:
+        console.print(f"{directory}: this run is finished; nothing is left to do.")
+        return
+    _carry_on(learner)
+
+
+@app.command()
+def trials(
+    env: Env,
+    utility: Utility = None,
+    iterations: Iterations = None,
+    kl_bound: KLBound = None,
+    likelihood: Likelihood = None,
+    prior_scale: PriorScale = None,
+    steepness: Steepness = None,
+    lapse_rate: LapseRate = None,
+    wrong_answers: WrongAnswers = None,
+    policy: PolicyKind = None,
+    centres: Centres = None,
+    max_steps: MaxSteps = None,
+    expert: Expert = None,
+    number: Annotated[int, typer.Option("--trials", help="How many seeds.")] = 20,
+    jobs: Annotated[int, typer.Option(help="Trials at a time, each in a process of its own.")] = 1,
+    seed: Annotated[int, typer.Option(help="The first seed.")] = 1000,
+    out: Annotated[Path | None, typer.Option(help="Directory of the study; under runs/ when left out.")] = None,
+) -> None:
+    """Run many seeds side by side and print median and quartiles; a second call does only what is missing."""
+    from bayespbrl.trials import run_trials
+
+    taken = ("env", "number", "jobs", "seed", "out", "run_trials")
+    options = {name: value for name, value in locals().items() if name not in taken}
+    directory = out or Path("runs") / f"trials-{env.replace('/', '-').lower()}-{utility or 'posterior-mean'}"
+    with _progress("{task.fields[state]}") as bar:
+        task = bar.add_task("trials", total=number, state=f"{directory}")
+        study = run_trials(
+            env, directory, trials=number, jobs=jobs, seed=seed, progress=lambda _: bar.advance(task), **options
+        )
+        bar.update(task, completed=number)
+    _print_trials(study)
+
+
+def main() -> None:
+    """Entry point: bad input is one line on standard error and exit status 2."""
+    try:
+        status = app(standalone_mode=False)
+    except ValueError as error:
+        status = _complain(str(error))
+    except (KeyboardInterrupt, typer.Abort):
+        status = 130
+    except typer.Exit as stop:
+        status = stop.exit_code
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # Typer's usage errors, whose common class it does not export
+            raise
+        status = _complain(error.format_message())
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _complain(message: str) -> int:
+    print(f"bayespbrl: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _carry_on(learner: Any) -> None:
+    """Run a logged learner to its end, showing how it goes, and say where everything is."""
+    directory = learner.log.path
+    console.print(f"Run directory: {directory}")
+    try:
+        if learner.settings.expert == "terminal":
+            learner.run(_person(learner, directory), progress=_say)
+        else:
+            _run_with_bar(learner)
+    except KeyboardInterrupt:
+        console.print(f"\nStopped. Nothing is lost: bayespbrl resume {directory}")
+        raise
+    _print_iterations(learner)
+    from bayespbrl.diagnostics.plots import run_figure
+
+    picture = directory / "run.png"
+    run_figure(learner).savefig(picture, dpi=110)
+    console.print(f"Run directory: {directory}\nPicture: {picture}")
+
+
+def _run_with_bar(learner: Any) -> None:
+    from bayespbrl.experts import simulated_expert
+
+    with _progress("{task.fields[state]}") as bar:
+        total, done = learner.settings.iterations, learner.state.iteration
+        task = bar.add_task("iterations", total=total, completed=done, state=_state(learner))
+        learner.run(
+            simulated_expert(learner.settings.wrong_answers, seed=learner.settings.seed),
+            progress=lambda now: bar.update(task, completed=now.state.iteration, state=_state(now)),
+        )
+        bar.update(task, completed=learner.state.iteration, state=_state(learner))
+
+
+def _progress(state: str) -> Progress:
+    columns = (TextColumn("{task.description} {task.completed}/{task.total}"), BarColumn(), TimeElapsedColumn())
+    return Progress(*columns, TextColumn(state), console=console)
+
+
+def _state(learner: Any) -> str:
+    text = f"answers {learner.preferences.answers}"
+    if learner.iterations:
+        last = learner.iterations[-1]
+        text += f"  value {last['value']:.2f}  R̂ {_number(last['rhat_max'], '.3f')}"
+    return text
+
+
+def _say(learner: Any) -> None:
+    console.print(_state(learner))
+
+
+def _person(learner: Any, directory: Path) -> Any:
+    """The person at this terminal, who sees pictures of the two trajectories."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from bayespbrl.envs.pictures import draw_trajectory
+    from bayespbrl.experts import TerminalExpert
+
+    def draw(first: Any, second: Any, path: Path) -> None:
+        figure = Figure(figsize=(11, 5), layout="constrained")
+        FigureCanvasAgg(figure)
+        for axes, trajectory, name in zip(figure.subplots(1, 2), (first, second), ("first", "second"), strict=True):
+            draw_trajectory(learner.environment, trajectory, axes)
+            axes.set_title(f"{name}: {axes.get_title()}")
+        figure.savefig(path, dpi=100)
+
+    return TerminalExpert(draw, directory)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def _table(title: str, columns: list[str], rows: list[list[str]]) -> None:
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def _optimum(environment: Any) -> float | None:
+    return getattr(getattr(environment.unwrapped, "dynamics", None), "optimal_return", None)
+
+
+def _print_iterations(learner: Any) -> None:
+    """A row for the first iteration, every fifth and the last."""
+    optimum = _optimum(learner.environment)
+    rows = [
+        [
+            str(s["answers"]),
+            f"{s['value']:.2f}",
+            *([] if optimum is None else [f"{s['value'] / optimum:.3f}"]),
+            f"{s['pairs_satisfied']}/{s['pairs']}",
+            f"{s['kl']:.3f}/{s['kl_bound']:g}",
+            _number(s["rhat_max"], ".3f"),
+            _number(s["effective_sample_size_min"], ".0f"),
+        ]
+        for s in learner.iterations
+        if s["iteration"] % 5 == 0 or s["iteration"] in (1, len(learner.iterations))
+    ]
+    share = [] if optimum is None else ["of optimum"]
+    columns = ["answers", "value", *share, "pairs satisfied", "KL/bound", "R̂", "effective draws"]
+    _table(f"{learner.settings.env}, {learner.settings.utility}, seed {learner.settings.seed}", columns, rows)
+
+
+def _print_trials(study: Any) -> None:
+    """Median and quartiles by number of answers, and how honest the numerics were."""
+    from bayespbrl.rollouts import open_environment
+
+    table, quartiles = study.table, study.quartiles()
+    optimum = _optimum(open_environment(table.attrs["env"]))
+    names = ("lower_quartile", "median", "upper_quartile")
+    rows = []
+    for iteration in quartiles["iteration"].values:
+        at = quartiles.sel(iteration=iteration)
+        shares = [] if optimum is None else [f"{float(at[name]) / optimum:.3f}" for name in names]
+        rows.append([f"{float(at['answers']):g}", *(f"{float(at[name]):.2f}" for name in names), *shares])
+    columns = ["answers", "lower quartile", "median", "upper quartile"]
+    columns += [] if optimum is None else [f"{name}, of optimum" for name in ("lower", "median", "upper")]
+    _table(f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials", columns, rows)
+    active = table["bound_active"].values.astype(bool)
+    deviation = abs(table["kl"] / table["kl_bound"] - 1).values[active].max(initial=0.0)
+    console.print(
+        f"KL bound active in {active.sum()} of {active.size} iterations, met within {deviation:.2%} there; "
+        f"whitened feature gap at most {float(table['feature_gap'].max()):.1e}, raw "
+        f"{float(table['feature_gap_raw'].max()):.1e}; rank kept {int(table['rank_kept'].min())} to "
+        f"{int(table['rank_kept'].max())}; utility fits not converged: "
+        f"{int((~table['utility_converged'].values.astype(bool)).sum())}."
+    )
+    console.print(f"Tables: {study.path / 'trials.csv'}, {study.path / 'trials.nc'}")

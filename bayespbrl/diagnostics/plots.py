@@ -1,0 +1,92 @@
+"""Figures of a run. Each function draws on the matplotlib axes it is given and returns them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from bayespbrl.cycle import Learner
+from bayespbrl.trajectories import Transitions, transitions
+
+
+def learning_curve(iterations: Sequence[Mapping[str, Any]], axes: Axes, *, optimum: float | None = None) -> Axes:
+    """Value against answers.
+
+    Args:
+      iterations: summaries of the completed iterations.
+      axes: to draw on.
+      optimum: drawn as a line when given.
+    """
+    axes.plot([s["answers"] for s in iterations], [s["value"] for s in iterations], marker="o", markersize=3)
+    if optimum is not None:
+        axes.axhline(optimum, color="0.5", linestyle="--", linewidth=1)
+        axes.annotate("optimal", (0.02, optimum), xycoords=("axes fraction", "data"), va="bottom", color="0.4")
+    axes.set(xlabel="answers", ylabel="value (mean return)", title="Learning curve")
+    return axes
+
+
+def utility_beside_reward(learner: Learner, utility_axes: Axes, reward_axes: Axes) -> tuple[Axes, Axes]:
+    """The inferred utility and the hidden reward of the states seen so far.
+
+    A grid's cells as two maps; two-dimensional observations as two clouds of points; for any other observations, the
+    utility of each step against its reward, and of each trajectory against its return.
+    """
+    steps = transitions(learner.trajectories)
+    utilities = learner.estimate.step_utilities(steps)
+    shape = getattr(getattr(learner.environment.unwrapped, "dynamics", None), "grid_shape", None)
+    if shape is not None:
+        draw = _map_of_cells
+    elif steps.states.ndim == 2 and steps.states.shape[1] == 2:
+        draw = _cloud
+    else:
+        return _scatter(utilities, steps.rewards, learner, utility_axes, reward_axes)
+    for axes, values, title in (
+        (utility_axes, utilities, "Inferred utility"),
+        (reward_axes, steps.rewards, "Hidden reward"),
+    ):
+        draw(steps, values, axes, shape)
+        axes.set_title(title)
+    return utility_axes, reward_axes
+
+
+def run_figure(learner: Learner) -> Figure:
+    """The learning curve, and the inferred utility beside the hidden reward, as one figure."""
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    curve, utility, reward = figure.subplots(1, 3)
+    dynamics = getattr(learner.environment.unwrapped, "dynamics", None)
+    learning_curve(learner.iterations, curve, optimum=getattr(dynamics, "optimal_return", None))
+    utility_beside_reward(learner, utility, reward)
+    return figure
+
+
+def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, shape: tuple[int, int]) -> None:
+    """Mean value on arrival in each cell; cells never entered stay blank."""
+    size = shape[0] * shape[1]
+    counts = np.bincount(steps.next_states, minlength=size)
+    sums = np.bincount(steps.next_states, weights=values, minlength=size)
+    means = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan).reshape(shape)
+    image = axes.imshow(means, cmap="viridis")
+    axes.figure.colorbar(image, ax=axes, shrink=0.8)
+    axes.set_xticks(range(shape[1]), [str(j + 1) for j in range(shape[1])])
+    axes.set_yticks(range(shape[0]), [str(i + 1) for i in range(shape[0])])
+
+
+def _cloud(steps: Transitions, values: np.ndarray, axes: Axes, shape: None) -> None:
+    points = axes.scatter(*steps.next_states.T, c=values, s=4, cmap="viridis")
+    axes.figure.colorbar(points, ax=axes, shrink=0.8)
+    axes.set(xlabel="observation 0", ylabel="observation 1")
+
+
+def _scatter(
+    utilities: np.ndarray, rewards: np.ndarray, learner: Learner, step_axes: Axes, trajectory_axes: Axes
+) -> tuple[Axes, Axes]:
+    step_axes.scatter(rewards, utilities, s=4, alpha=0.3)
+    step_axes.set(xlabel="hidden reward", ylabel="inferred utility", title="Steps")
+    returns = [trajectory.total_reward for trajectory in learner.trajectories]
+    trajectory_axes.scatter(returns, learner.estimate.trajectory_utilities(learner.trajectories), s=10)
+    trajectory_axes.set(xlabel="hidden return", ylabel="inferred utility", title="Trajectories")
+    return step_axes, trajectory_axes
