@@ -27,6 +27,8 @@ class GridworldDynamics(FuncEnv):
     action_space = Discrete(len(MOVES))
     max_episode_steps = 300
     observation_period: tuple[float, ...] = (np.inf,)
+    grid_shape = (SIZE, SIZE)
+    optimal_return = 294.8125  # expected over 300 steps, by dynamic programming on `transition_table`
 
     def initial(self, rng: jax.Array, params: Any = None) -> jax.Array:
         """The centre cell."""
