@@ -52,6 +52,7 @@ class Learner:
         self.settings: Settings = settings_for(
             env if isinstance(env, str) else environment_name(self.environment),
             policy=policy if own_policy is None else "other",
+            features="drawn" if features is None else "other",
             **settings,
         )
         self.features = features
@@ -288,7 +289,7 @@ class Learner:
         )
 
     @property
-    def _period(self) -> tuple[float, ...] | None:
+    def _period(self) -> Any:
         return getattr(getattr(self.environment.unwrapped, "dynamics", None), "observation_period", None)
 
     # Memory and chance.

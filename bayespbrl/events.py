@@ -111,10 +111,38 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
 
 
 def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
-    """The state after all of `entries`."""
+    """The state after all of `entries`.
+
+    Raises:
+      ValueError: as `apply`; also an event that lacks what it should say, as in a foreign log.
+    """
     for entry in entries:
-        state = apply(state, entry)
+        try:
+            state = apply(state, entry)
+        except (KeyError, TypeError, IndexError) as error:
+            reason = f"{type(error).__name__} {error}"
+            raise ValueError(f"event: expected a complete one, got {dict(entry.event)} ({reason})") from error
     return state
+
+
+def surviving(log: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The events that lead to the same state without any undoing.
+
+    What was undone is left out, and not only to save time: its heavy parts may have been written over since.
+
+    Raises:
+      ValueError: an `undone` without an answer before it.
+    """
+    kept: list[Mapping[str, Any]] = []
+    for event in log:
+        if event.get("event") != "undone":
+            kept.append(event)
+            continue
+        answers = [number for number, earlier in enumerate(kept) if earlier.get("event") == "answered"]
+        if not answers:
+            raise ValueError("undo: expected an answer to take back, got none yet")
+        del kept[answers[-1] :]
+    return kept
 
 
 def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:

@@ -23,7 +23,7 @@ import xarray as xr
 
 from bayespbrl import records, rollouts
 from bayespbrl.cycle import Learner
-from bayespbrl.events import Entry, LearnerState
+from bayespbrl.events import Entry, LearnerState, surviving
 from bayespbrl.models import restored, stored
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
@@ -69,6 +69,7 @@ def resume(directory: Path | str, *, env: Any = None, features: Any = None, poli
     log = RunDirectory.open(directory)
     learner = _restored(log, env, features, policy)
     log.drop_partial_line()
+    log.write_summary(learner.state)  # a process killed between an event and its summary left an old one
     return learner.logged(log)
 
 
@@ -81,8 +82,10 @@ def load(directory: Path | str, *, env: Any = None, features: Any = None, policy
 def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any) -> Learner:
     settings = asdict(log.settings)
     name, kind = settings.pop("env"), settings.pop("policy")
-    if policy is None and kind == "other":
-        raise ValueError(f"{log.path}: a run with a policy of the user's own: pass one again as policy=")
+    for part, own, given in (("features", settings.pop("features"), features), ("policy", kind, policy)):
+        if (own == "other") != (given is not None):
+            had, expected = ("with", "it again as") if own == "other" else ("without", "no")
+            raise ValueError(f"{log.path}: a run {had} {part} of the user's own: expected {expected} {part}=")
     try:
         return Learner(
             name if env is None else env,
@@ -209,29 +212,47 @@ class RunDirectory:
         """Keep one event: first its heavy parts, then its line, flushed to the disk."""
         if entry.parts:
             write_iteration(self._iteration(entry.event["iteration"]), entry)
-        with (self.path / "events.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(dict(entry.event), allow_nan=False) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        if entry.event["event"] in ("improved", "undone"):
-            self._write_summary(state)
+        line = (json.dumps(dict(entry.event), allow_nan=False) + "\n").encode()
+        with (self.path / "events.jsonl").open("ab", buffering=0) as file:
+            before = file.tell()
+            try:
+                if file.write(line) != len(line):
+                    raise OSError(f"{file.name}: the line was not written whole")
+                os.fsync(file.fileno())
+                if entry.event["event"] in ("improved", "undone"):
+                    self.write_summary(state)
+            except BaseException:  # a full disk or Ctrl-C: the learner will not have moved on either
+                file.truncate(before)
+                raise
+
+    def finished(self) -> bool:
+        """Whether the run has completed all its iterations, by its summary."""
+        return (self.path / "summary.json").exists() and bool(read_summary(self.path)["finished"])
 
     def entries(self, *, features: Any = None, known: Sequence[type] = ()) -> Iterator[Entry]:
-        """The events so far with their heavy parts; a last line that was cut off is left out."""
-        for number, line in enumerate(self._complete_lines(), start=1):
-            where = f"events.jsonl, line {number}"
-            try:
-                event = json.loads(line)
-            except ValueError as error:
-                raise ValueError(f"{where}: expected an event, got {line[:60]!r}") from error
-            if not isinstance(event, dict) or "event" not in event:
-                raise ValueError(f"{where}: expected an event, got {line[:60]!r}")
+        """The events so far, what was undone left out, with their heavy parts; neither is a last line cut off."""
+        for event in surviving(self._events()):
             parts = {}
             if event["event"] in ("collected", "improved"):
                 parts = read_iteration(
                     self._iteration(event["iteration"]), event["event"], features=features, known=known
                 )
             yield Entry(event, parts)
+
+    def _events(self) -> Iterator[dict[str, Any]]:
+        for number, line in enumerate(self._complete_lines(), start=1):
+            try:
+                event = json.loads(line)
+            except ValueError:
+                event = None
+            heavy = isinstance(event, dict) and event.get("event") in ("collected", "improved")
+            if (
+                not isinstance(event, dict)
+                or "event" not in event
+                or (heavy and type(event.get("iteration")) is not int)
+            ):
+                raise ValueError(f"events.jsonl, line {number}: expected an event, got {line[:60]!r}")
+            yield event
 
     def drop_partial_line(self) -> None:
         """Cut off a last line that a killed process left half-written, so that the next event starts a new one."""
@@ -254,7 +275,8 @@ class RunDirectory:
     def _iteration(self, number: int) -> Path:
         return self.path / "iterations" / f"{number:04d}.nc"
 
-    def _write_summary(self, state: LearnerState) -> None:
+    def write_summary(self, state: LearnerState) -> None:
+        """Write `summary.json` anew."""
         summary = {
             "env": self.settings.env,
             "utility": self.settings.utility,
@@ -264,6 +286,18 @@ class RunDirectory:
             "iterations": list(state.summaries),
         }
         _write(self.path / "summary.json", json.dumps(summary, indent=1) + "\n")
+
+
+def read_summary(directory: Path | str) -> dict[str, Any]:
+    """`summary.json` of a run; `ValueError` if it is missing, truncated or foreign."""
+    file = Path(directory) / "summary.json"
+    try:
+        summary = json.loads(file.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{file}: expected the summary of a run, got {error}") from error
+    if not isinstance(summary, dict) or not {"seed", "finished", "iterations"} <= set(summary):
+        raise ValueError(f"{file}: expected the summary of a run, got a foreign file")
+    return summary
 
 
 def fresh_directory(env: str) -> Path:
@@ -284,6 +318,7 @@ def write_iteration(file: Path, entry: Entry) -> None:
         groups["policy"] = records.to_tree(parts["policy"])
         groups |= _estimate_groups(parts["estimate"])
     aside = file.with_suffix(".nc.part")
+    aside.unlink(missing_ok=True)  # HDF5 refuses a file that an interrupted write left open
     xr.DataTree.from_dict(groups).to_netcdf(aside, engine=ENGINE)
     with aside.open("rb") as written:
         os.fsync(written.fileno())
@@ -295,9 +330,9 @@ def read_iteration(file: Path, event: str, *, features: Any = None, known: Seque
     try:
         with xr.open_datatree(file, engine=ENGINE) as opened:
             tree = opened.load()
-        parts: dict[str, Any] = {"trajectories": _read_trajectories(tree["trajectories"].to_dataset())}
+        parts: dict[str, Any] = {"trajectories": _read_trajectories(tree.children["trajectories"].to_dataset())}
         if event == "improved":
-            parts["policy"] = records.from_tree(tree["policy"], known=known)
+            parts["policy"] = records.from_tree(tree.children["policy"], known=known)
             parts["estimate"] = _read_estimate(tree, features, known)
     except (OSError, KeyError, RuntimeError, AttributeError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -351,25 +386,27 @@ def _estimate_groups(estimate: Any) -> dict[str, xr.DataTree]:
     groups = {"utility": xr.DataTree(data, children=children)}
     if estimate.posterior is not None:
         small = stored(estimate.posterior)
-        groups |= {name: small[name] for name in POSTERIOR_GROUPS if name in small.children}
+        groups |= {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
         groups["fit"] = xr.DataTree(small.to_dataset())
     return groups
 
 
 def _read_estimate(tree: xr.DataTree, features: Any, known: Sequence[type]) -> Any:
-    utility = tree["utility"]
+    utility = tree.children["utility"]
     if "class" in utility.attrs:
         return records.from_tree(utility, known=known)
     if "features" in utility.children:
-        features = records.from_tree(utility["features"], known=known)
+        features = records.from_tree(utility.children["features"], known=known)
     elif features is None:
         raise ValueError("a run with features of the user's own: pass them again as features=")
     posterior = None
     if "fit" in tree.children:
-        groups = {name: tree[name] for name in POSTERIOR_GROUPS if name in tree.children}
-        posterior = restored(xr.DataTree(tree["fit"].to_dataset(), children=groups))
-    quality = records.from_tree(utility["quality"])
-    return LinearUtility(features, utility["weights"].values, float(utility.attrs["discount"]), quality, posterior)
+        groups = {name: tree.children[name] for name in POSTERIOR_GROUPS if name in tree.children}
+        posterior = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
+    quality = records.from_tree(utility.children["quality"])
+    return LinearUtility(
+        features, utility.dataset["weights"].values, float(utility.attrs["discount"]), quality, posterior
+    )
 
 
 def _write(file: Path, text: str) -> None:

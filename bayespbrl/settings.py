@@ -8,6 +8,7 @@ UTILITIES = ("posterior-mean", "most-likely", "linear-program", "known-reward")
 LIKELIHOODS = ("mixed", "logistic", "probit")
 EXPERTS = ("return", "terminal", "other")
 POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
+FEATURES = ("drawn", "other")
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Settings:
       discount: γ.
       policy: the kind of policy; `auto` takes tabular for discrete states, softmax for discrete actions in continuous
         states, gaussian-process otherwise; `other` stands for a policy of the user's.
+      features: φ(s) as `drawn` by the settings, or `other`, a function of the user's.
       evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
       max_steps: steps an episode; None for the environment's own limit.
       centres: radial basis functions of each kind of feature.
@@ -53,6 +55,7 @@ class Settings:
     first_queries: int = 2
     discount: float = 0.98
     policy: str = "auto"
+    features: str = "drawn"
     evaluation_episodes: int = 100
     max_steps: int | None = None
     centres: int = 300
@@ -67,6 +70,7 @@ class Settings:
         _one_of("utility", self.utility, UTILITIES)
         _one_of("likelihood", self.likelihood, LIKELIHOODS)
         _one_of("policy", self.policy, POLICIES)
+        _one_of("features", self.features, FEATURES)
         for name in ("kl_bound", "prior_scale", "steepness", "bandwidth_factor", "initial_action_scale"):
             _number(name, getattr(self, name), lambda value: value > 0, "a positive finite number")
         for name in ("fixed_point_ridge", "projection_ridge"):
