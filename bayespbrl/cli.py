@@ -55,10 +55,10 @@ def run(
     out: Annotated[Path | None, typer.Option(help="Run directory; a fresh one under runs/ when left out.")] = None,
 ) -> None:
     """Learn a task from preferences and keep the run in a directory."""
+    options = _without(locals(), "env", "out")
     from bayespbrl import runs
 
-    options = {name: value for name, value in locals().items() if name not in ("env", "seed", "out", "runs")}
-    _carry_on(runs.start(env, out, seed=seed, **options))
+    _carry_on(runs.start(env, out, **options))
 
 
 @app.command()
@@ -94,16 +94,13 @@ def trials(
     out: Annotated[Path | None, typer.Option(help="Directory of the study; under runs/ when left out.")] = None,
 ) -> None:
     """Run many seeds side by side and print median and quartiles; a second call does only what is missing."""
+    options = _without(locals(), "env", "number", "jobs", "out")
     from bayespbrl.trials import run_trials
 
-    taken = ("env", "number", "jobs", "seed", "out", "run_trials")
-    options = {name: value for name, value in locals().items() if name not in taken}
     directory = out or Path("runs") / f"trials-{env.replace('/', '-').lower()}-{utility or 'posterior-mean'}"
     with _progress("{task.fields[state]}") as bar:
         task = bar.add_task("trials", total=number, state=f"{directory}")
-        study = run_trials(
-            env, directory, trials=number, jobs=jobs, seed=seed, progress=lambda _: bar.advance(task), **options
-        )
+        study = run_trials(env, directory, trials=number, jobs=jobs, progress=lambda _: bar.advance(task), **options)
         bar.update(task, completed=number)
     _print_trials(study)
 
@@ -123,6 +120,11 @@ def main() -> None:
             raise
         status = _complain(error.format_message())
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _without(options: dict[str, Any], *names: str) -> dict[str, Any]:
+    """The options of a run among a command's parameters."""
+    return {name: value for name, value in options.items() if name not in names}
 
 
 def _complain(message: str) -> int:
@@ -249,9 +251,9 @@ def _print_trials(study: Any) -> None:
         at = quartiles.sel(iteration=iteration)
         shares = [] if optimum is None else [f"{float(at[name]) / optimum:.3f}" for name in names]
         rows.append([f"{float(at['answers']):g}", *(f"{float(at[name]):.2f}" for name in names), *shares])
-    columns = ["answers", "lower quartile", "median", "upper quartile"]
-    columns += [] if optimum is None else [f"{name}, of optimum" for name in ("lower", "median", "upper")]
-    _table(f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials", columns, rows)
+    columns = ["answers", "25 %", "median", "75 %"] + ([] if optimum is None else ["25 %", "median", "75 %"])
+    title = f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials: quartiles of the value"
+    _table(title + ("" if optimum is None else ", and as a fraction of the optimum"), columns, rows)
     active = table["bound_active"].values.astype(bool)
     deviation = abs(table["kl"] / table["kl_bound"] - 1).values[active].max(initial=0.0)
     console.print(

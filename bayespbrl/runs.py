@@ -377,7 +377,9 @@ def _estimate_groups(estimate: Any) -> dict[str, xr.DataTree]:
     """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
     if not isinstance(estimate, LinearUtility):
         return {"utility": records.to_tree(estimate)}
-    data = xr.Dataset({"weights": ("feature", estimate.weights)}, attrs={"discount": estimate.discount})
+    data = xr.Dataset(
+        {"weights": ("feature", estimate.weights)}, attrs={"discount": estimate.discount, "scale": estimate.scale}
+    )
     children = {"quality": records.to_tree(estimate.quality)}
     try:
         children["features"] = records.to_tree(estimate.features)

@@ -12,6 +12,7 @@ from bayespbrl.preferences import pair_differences
 from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
 
 StateFeatures = Callable[[np.ndarray], np.ndarray]
+WEIGHTS = {"posterior-mean": "utility_weights_mean", "most-likely": "utility_weights_most_likely"}
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class LinearUtility:
       discount: γ of ψ(τ).
       quality: how far it can be trusted.
       posterior: draws in ArviZ's schema; None for the linear program.
+      scale: what the differences were divided by: a draw of the posterior over `scale` is in the units of φ.
     """
 
     features: StateFeatures
@@ -66,6 +68,7 @@ class LinearUtility:
     discount: float
     quality: FitQuality
     posterior: DataTree | None = None
+    scale: float = 1.0
 
     def utilities(self, states: np.ndarray) -> np.ndarray:
         """wᵀφ(s) of N states, shape (N,)."""
@@ -77,6 +80,22 @@ class LinearUtility:
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> np.ndarray:
         return trajectory_features(trajectories, self.features, discount=self.discount) @ self.weights
+
+    def draws(self, features: np.ndarray) -> np.ndarray:
+        """Posterior draws of wᵀφ for each row of `features`, (n, D): of states, or of feature sums ψ(τ).
+
+        Returns:
+          shape (chain, draw, n), in the units of `weights`.
+
+        Raises:
+          ValueError: an estimate without a posterior, or features of another length.
+        """
+        if self.posterior is None:
+            raise ValueError("draws: expected an estimate with a posterior, got one without")
+        if features.ndim != 2 or features.shape[1] != len(self.weights):
+            raise ValueError(f"features: expected shape (n, {len(self.weights)}), got {features.shape}")
+        weights = self.posterior["posterior"]["utility_weights"].values
+        return weights @ features.T / self.scale
 
 
 @dataclass(frozen=True)
@@ -125,13 +144,58 @@ def estimate_utility(
         returns = np.array([trajectory.total_reward for trajectory in trajectories])
         satisfied = sum(bool(returns[i] > returns[j]) for i, j in pairs)
         return KnownReward(FitQuality(True, "known reward", len(pairs), satisfied))
-    differences = pair_differences(pairs, trajectory_features(trajectories, features, discount=discount))
+    return infer_utility(
+        trajectory_features(trajectories, features, discount=discount),
+        pairs,
+        features=features,
+        method=method,
+        discount=discount,
+        prior_scale=prior_scale,
+        steepness=steepness,
+        lapse_rate=lapse_rate,
+        likelihood=likelihood,
+        seed=seed,
+    )
+
+
+def infer_utility(
+    feature_sums: np.ndarray,
+    pairs: Sequence[tuple[int, int]],
+    *,
+    features: StateFeatures | None = None,
+    method: str = "posterior-mean",
+    discount: float = 0.98,
+    prior_scale: float = 1.0,
+    steepness: float = 5.0,
+    lapse_rate: float = 0.0,
+    likelihood: str = "mixed",
+    seed: int = 0,
+) -> LinearUtility:
+    """The posterior without a learner: feature sums of anything that was compared, and the answers.
+
+    Args:
+      feature_sums: ψ of n trajectories, or the features of n items of any kind, shape (n, D).
+      pairs: K ordered pairs (preferred, dominated) of their row numbers.
+      features: φ, where utilities of single states are wanted too; the rows themselves otherwise.
+      method: `posterior-mean`, `most-likely` or `linear-program`.
+      discount, prior_scale, steepness, lapse_rate, likelihood, seed: as of `estimate_utility`.
+
+    Raises:
+      ValueError: a method there is not, feature sums that are no finite matrix, pairs that name no row.
+    """
+    feature_sums = np.asarray(feature_sums, dtype=np.float64)
+    if feature_sums.ndim != 2 or not np.all(np.isfinite(feature_sums)):
+        raise ValueError(f"feature_sums: expected a finite matrix (n, D), got shape {feature_sums.shape} or NaN")
+    if method not in WEIGHTS and method != "linear-program":
+        raise ValueError(f"method: expected {', '.join(WEIGHTS)} or linear-program, got {method!r}")
+    features = _as_they_are if features is None else features
+    differences = pair_differences(pairs, feature_sums)
     scale = float(np.max(np.abs(differences), initial=0.0)) or 1.0
     if method == "linear-program":
         program = linear_program(differences / scale)
         satisfied = int(np.sum(differences @ program.weights > 0))
         quality = FitQuality(program.converged, program.status, len(pairs), satisfied)
-        return LinearUtility(features, program.weights / scale, discount, quality)
+        return LinearUtility(features, program.weights / scale, discount, quality, scale=scale)
     tree = sample_posterior(
         differences / scale,
         prior_scale=prior_scale,
@@ -140,8 +204,7 @@ def estimate_utility(
         likelihood=likelihood,
         seed=seed,
     )
-    name = {"posterior-mean": "utility_weights_mean", "most-likely": "utility_weights_most_likely"}[method]
-    weights = np.asarray(tree[name]) / scale
+    weights = np.asarray(tree[WEIGHTS[method]]) / scale
     quality = FitQuality(
         converged=bool(tree.attrs["converged"]),
         status="converged" if tree.attrs["converged"] else "the sampler did not converge within its cap of draws",
@@ -151,4 +214,8 @@ def estimate_utility(
         effective_sample_size_min=float(tree.attrs["effective_sample_size_min"]),
         log_evidence=float(tree.attrs["log_evidence"]),
     )
-    return LinearUtility(features, weights, discount, quality, tree)
+    return LinearUtility(features, weights, discount, quality, tree, scale)
+
+
+def _as_they_are(features: np.ndarray) -> np.ndarray:
+    return features
