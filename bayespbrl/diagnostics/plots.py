@@ -76,7 +76,8 @@ def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, shape: tup
 
 
 def _cloud(steps: Transitions, values: np.ndarray, axes: Axes, shape: None) -> None:
-    points = axes.scatter(*steps.next_states.T, c=values, s=4, cmap="viridis")
+    first, second = steps.next_states.T
+    points = axes.scatter(first, second, c=values, s=4, cmap="viridis")
     axes.figure.colorbar(points, ax=axes, shrink=0.8)
     axes.set(xlabel="observation 0", ylabel="observation 1")
 

@@ -7,14 +7,13 @@ from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
-from bayespbrl.policies.policy import Policy
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
 
 def initial_policy(
     kind: str, observation_space: Space, action_space: Space, *, action_scale: float = 0.75, period: Any = None
-) -> Policy:
+) -> Any:
     """The first policy of a run: as random as the action space allows.
 
     Args:
