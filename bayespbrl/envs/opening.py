@@ -1,5 +1,6 @@
 """Any gymnasium environment, made ready for the learner: opened by name, its spaces checked and flattened."""
 
+from importlib import import_module
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -28,8 +29,9 @@ def open_environment(environment: str | EnvSpec | gymnasium.Env | FuncEnv) -> gy
       ValueError: unknown name; an environment that cannot be made; a space that is neither `Box` nor `Discrete`.
     """
     if isinstance(environment, str | EnvSpec):
-        opened = flattened(_make(environment))
-        _MADE_FROM[opened] = _spec(environment)
+        spec = _spec(environment)
+        opened = flattened(_make(spec))
+        _MADE_FROM[opened] = spec
         return opened
     if isinstance(environment, FuncEnv):
         return flattened(FunctionalEnv(environment))
@@ -57,19 +59,28 @@ def environment_name(env: gymnasium.Env) -> str:
 def _spec(environment: str | EnvSpec) -> EnvSpec:
     if isinstance(environment, EnvSpec):
         return environment
-    return gymnasium.spec(SHORT_NAMES.get(environment, environment))
-
-
-def _make(environment: str | EnvSpec) -> gymnasium.Env:
+    name = SHORT_NAMES.get(environment, environment)
     try:
-        return gymnasium.make(_spec(environment))
-    except (gymnasium.error.UnregisteredEnv, gymnasium.error.DeprecatedEnv, ModuleNotFoundError) as error:
+        module, _, name = name.rpartition(":")  # "package:Env-v0", as gymnasium has it, imports the package first
+        if module:
+            import_module(module)
+        return gymnasium.spec(name)
+    except (gymnasium.error.Error, ImportError) as error:
         raise ValueError(
             f"environment: expected {', '.join(SHORT_NAMES)} or a registered gymnasium id, got {environment!r} "
-            f"({' '.join(str(error).split())})"
+            f"({_one_line(error)})"
         ) from error
+
+
+def _make(spec: EnvSpec) -> gymnasium.Env:
+    try:
+        return gymnasium.make(spec)
     except Exception as error:
-        raise ValueError(f"environment {environment!r} cannot be made: {' '.join(str(error).split())}") from error
+        raise ValueError(f"environment {spec.id} cannot be made: {_one_line(error)}") from error
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:

@@ -72,39 +72,33 @@ def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None) -> VectorEnv
 
 def _batch(vector: VectorEnv, name: str, act: Any, seed: int, steps: int) -> list[Episode]:
     """One episode a lane. A lane that has ended is stepped on with the others (it resets itself), and ignored."""
-    lanes = vector.num_envs
+    lanes, seen, done = vector.num_envs, vector.single_observation_space, vector.single_action_space
     with _blaming(name, "its reset"):
         observations, _ = vector.reset(seed=seed)
     alive, ended, lengths = np.ones(lanes, bool), np.zeros(lanes, bool), np.zeros(lanes, int)
-    states, actions, rewards = [_checked(name, "its reset", _wide(observations))], [], []
+    states, actions, rewards = [_checked(name, "its reset", _wide(seen, observations))], [], []
     t = 0
     while t < steps and alive.any():
-        actions.append(_within(vector.single_action_space, act(t, states[-1])))
+        actions.append(_within(done, act(t, states[-1])))
         t += 1
         with _blaming(name, f"step {t}"):
             observations, reward, terminated, truncated, _ = vector.step(actions[-1])
-        _checked(name, f"step {t}", _wide(observations)[alive], np.asarray(reward)[alive])
+        _checked(name, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
         # what idle lanes return must not reach the policy as NaN
-        states.append(np.nan_to_num(_wide(observations)))
+        states.append(np.nan_to_num(_wide(seen, observations)))
         rewards.append(np.asarray(reward, float))
         lengths += alive
         ended |= alive & terminated
         alive &= ~(terminated | truncated)
-    table = np.stack(states), _wide(np.stack(actions)), np.stack(rewards)
+    table = np.stack(states), _wide(done, np.stack(actions)), np.stack(rewards)
     return [
         (table[0][: n + 1, i].copy(), table[1][:n, i].copy(), table[2][:n, i].copy(), bool(ended[i]))
         for i, n in enumerate(lengths)
     ]
 
 
-def _wide(values: np.ndarray) -> np.ndarray:
-    # Discrete spaces batch to (lanes,) integers, 1-D boxes to (lanes, S) of any number type
-    values = np.asarray(values)
-    return (
-        values.astype(np.int64)
-        if values.ndim == 1 and np.issubdtype(values.dtype, np.integer)
-        else values.astype(float)
-    )
+def _wide(space: Any, values: Any) -> np.ndarray:
+    return np.asarray(values).astype(float if isinstance(space, Box) else np.int64)
 
 
 def _within(space: Any, actions: np.ndarray) -> np.ndarray:

@@ -1,0 +1,324 @@
+"""Step 3: compiled rollouts, the gymnasium interface, and what happens when either goes wrong."""
+
+from dataclasses import dataclass
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.experimental.functional import FuncEnv
+from gymnasium.spaces import Box, Discrete
+
+from bayespbrl import rollouts
+from bayespbrl.envs import functional
+from bayespbrl.rollouts import returns, rollout
+
+KEY = jax.random.key(5)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Table:
+    probabilities: np.ndarray
+
+    def sample(self, key, observation):
+        return jax.random.categorical(key, jnp.log(self.probabilities[observation]))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Gaussian:
+    mean: np.ndarray
+    deviation: np.ndarray
+
+    def sample(self, key, observation):
+        return self.mean + self.deviation * jax.random.normal(key, self.mean.shape)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Coin:
+    probability: np.ndarray
+
+    def sample(self, key, observation):
+        return jax.random.bernoulli(key, self.probability).astype(int)
+
+
+UNIFORM_TABLE = Table(np.full((25, 5), 0.2))
+WIDE = Gaussian(np.zeros(2), np.array([2.0, 0.02]))
+
+
+class Plain(gymnasium.Env):
+    """Counts its steps, adds up the action, and can be told to go wrong at a step."""
+
+    observation_space = Box(-np.inf, np.inf, (2,), dtype=np.float64)
+    action_space = Box(-1.0, 1.0, (1,), dtype=np.float32)
+
+    def __init__(self, bad_observation=None, bad_reward=None, fails=None, ends=None):
+        self.bad_observation, self.bad_reward, self.fails, self.ends = bad_observation, bad_reward, fails, ends
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.total = 0, self.np_random.uniform()
+        return self._seen(), {}
+
+    def step(self, action):
+        assert action.dtype == np.float32
+        assert self.action_space.contains(action)
+        self.t += 1
+        self.total += float(action[0])
+        if self.t == self.fails:
+            raise RuntimeError("the motor is on fire")
+        return self._seen(), np.nan if self.t == self.bad_reward else 1.0, self.t == self.ends, False, {}
+
+    def _seen(self):
+        return np.array([np.nan if self.t == self.bad_observation else self.t, self.total])
+
+
+gymnasium.register("bayespbrl-tests/Plain-v0", entry_point=Plain, max_episode_steps=9)
+STEER = Gaussian(np.array([0.1]), np.array([3.0]))
+
+
+# Pure functions, compiled.
+
+
+def test_a_trajectory_is_the_loop_over_the_pure_functions():
+    trajectory = rollout("bicycle", WIDE, key=KEY, episodes=3)[1]
+    dynamics = rollouts.open_environment("bicycle").unwrapped.dynamics
+    with jax.enable_x64(True):
+        start_key, steps_key = jax.random.split(jax.random.split(KEY, 3)[1])
+        state, observation = functional.reset(dynamics, start_key)
+        np.testing.assert_allclose(trajectory.states[0], observation, rtol=1e-12)
+        for t, (action, reward) in enumerate(zip(trajectory.actions, trajectory.rewards, strict=True)):
+            action_key, transition_key = jax.random.split(jax.random.fold_in(steps_key, t))
+            by_hand = np.clip(WIDE.sample(action_key, observation), [-2, -0.02], [2, 0.02])
+            np.testing.assert_allclose(action, by_hand, rtol=1e-12)
+            state, observation, earned, _ = functional.step(dynamics, transition_key, state, by_hand)
+            np.testing.assert_allclose(trajectory.states[t + 1], observation, rtol=1e-9)
+            assert reward == pytest.approx(float(earned))
+
+
+def test_shapes_and_dtypes_of_discrete_and_continuous_trajectories():
+    discrete = rollout("gridworld", UNIFORM_TABLE, key=KEY, episodes=2)
+    assert len(discrete) == 2
+    assert discrete[0].states.shape == (301,)
+    assert discrete[0].actions.shape == discrete[0].rewards.shape == (300,)
+    assert discrete[0].states.dtype == discrete[0].actions.dtype == np.int64
+    continuous = rollout("swing-up", Gaussian(np.zeros(1), np.ones(1)), key=KEY, episodes=2)[0]
+    assert continuous.states.shape == (61, 2)
+    assert continuous.actions.shape == (60, 1)
+    assert {part.dtype for part in (continuous.states, continuous.actions, continuous.rewards)} == {np.dtype(float)}
+    assert not continuous.terminated
+    assert jnp.zeros(1).dtype == jnp.float32  # the caller's precision is as it was
+
+
+def test_a_trajectory_ends_with_its_last_real_state():
+    trajectories = rollout("bicycle", WIDE, key=KEY, episodes=60)
+    fallen = [trajectory for trajectory in trajectories if trajectory.terminated]
+    assert 5 < len(fallen) < 55
+    for trajectory in trajectories:
+        over = np.abs(trajectory.states[:, 2]) > np.pi / 15
+        assert not over[:-1].any()
+        assert over[-1] == trajectory.terminated
+        assert trajectory.terminated or len(trajectory) == 50
+        assert (trajectory.rewards[-1] < -100) == trajectory.terminated
+
+
+def test_stored_actions_are_clipped_to_the_action_space():
+    actions = np.concatenate([t.actions for t in rollout("bicycle", WIDE, key=KEY, episodes=20)])
+    assert np.abs(actions).max(axis=0).tolist() == [2.0, 0.02]
+
+
+def test_returns_are_those_of_the_same_rollout():
+    trajectories = rollout("bicycle", WIDE, key=KEY, episodes=40)
+    result = returns("bicycle", WIDE, key=KEY, episodes=40)
+    np.testing.assert_allclose(result.total, [t.total_reward for t in trajectories])
+    np.testing.assert_array_equal(result.steps, [len(t) for t in trajectories])
+    np.testing.assert_array_equal(result.terminated, [t.terminated for t in trajectories])
+
+
+def test_uniform_gridworld_return_is_the_exact_expectation():
+    total = returns("gridworld", UNIFORM_TABLE, key=KEY, episodes=4000).total
+    assert total.mean() == pytest.approx(44.34, abs=4 * total.std() / np.sqrt(4000))
+
+
+def test_the_key_decides_everything():
+    first, again, other = (rollout("swing-up", STEER, key=jax.random.key(k), episodes=2)[0] for k in (1, 1, 2))
+    np.testing.assert_array_equal(first.states, again.states)
+    assert np.any(first.states != other.states)
+
+
+def test_nothing_is_compiled_again_for_new_policies_keys_environments_or_evaluation_lengths():
+    def once(seed):
+        policy = Table(np.random.default_rng(seed).dirichlet(np.ones(5), size=25))
+        rollout("gridworld", policy, key=jax.random.key(seed), episodes=3)
+        returns("gridworld", policy, key=jax.random.key(seed), episodes=3, max_steps=50 + seed)
+        rollout("CartPole-v1", Coin(np.array(0.1 * seed)), key=jax.random.key(seed), episodes=3)
+
+    once(1)
+    before = rollouts.compilations()
+    assert before >= 3
+    for seed in range(2, 6):
+        once(seed)
+    assert rollouts.compilations() == before
+
+
+def test_an_explicit_limit_overrides_the_environments_own():
+    assert len(rollout("gridworld", UNIFORM_TABLE, key=KEY, episodes=1, max_steps=7)[0]) == 7
+    assert returns("gridworld", UNIFORM_TABLE, key=KEY, episodes=2, max_steps=400).steps.tolist() == [400, 400]
+    pole = Gaussian(np.zeros(1), np.ones(1))
+    assert len(rollout("Pendulum-v1", pole, key=KEY, episodes=2, max_steps=210)[1]) == 210  # its own: 200
+
+
+def test_users_wrappers_are_not_bypassed():
+    env = gymnasium.wrappers.TransformReward(gymnasium.make("bayespbrl/Gridworld-v0"), lambda reward: -reward)
+    trajectory = rollout(env, UNIFORM_TABLE, key=KEY, episodes=1, max_steps=20)[0]
+    assert np.all(trajectory.rewards < 0)
+
+
+class Drifting(FuncEnv):
+    """A user's own pure functions, in float32, whose reward is not finite from the fourth step on if so wished."""
+
+    observation_space = Box(-np.inf, np.inf, (1,), dtype=np.float32)
+    action_space = Discrete(2)
+
+    def initial(self, rng, params=None):
+        return jnp.zeros(1, jnp.float32)
+
+    def transition(self, state, action, rng, params=None):
+        return state + 1
+
+    def observation(self, state, rng, params=None):
+        return jnp.where((state == 3) & (self.bad == "observation"), jnp.nan, state)
+
+    def reward(self, state, action, next_state, rng, params=None):
+        return jnp.where((next_state[0] == 4) & (self.bad == "reward"), jnp.nan, next_state[0])
+
+    def terminal(self, state, rng, params=None):
+        return state[0] >= 6
+
+
+def test_a_users_pure_functions_run_compiled():
+    trajectory = rollout(Drifting({"bad": ""}), Coin(np.array(0.5)), key=KEY, episodes=2, max_steps=10)[0]
+    np.testing.assert_array_equal(trajectory.states, np.arange(7.0)[:, None])
+    assert trajectory.total_reward == 21
+    assert trajectory.terminated
+
+
+@pytest.mark.parametrize(("bad", "step"), [("observation", 3), ("reward", 4)])
+@pytest.mark.parametrize("run", [rollout, returns])
+def test_pure_functions_that_return_nan_are_named_with_the_step(run, bad, step):
+    with pytest.raises(ValueError, match=f"Drifting: .*NaN or infinity at step {step}"):
+        run(Drifting({"bad": bad}), Coin(np.array(0.5)), key=KEY, episodes=2, max_steps=10)
+
+
+# The gymnasium interface.
+
+
+@pytest.mark.parametrize(
+    "environment",
+    ["bayespbrl-tests/Plain-v0", EnvSpec("bayespbrl-tests/Copy-v0", entry_point=Plain, max_episode_steps=9)],
+)
+def test_copies_of_an_environment_run_side_by_side(environment):
+    trajectories = rollout(environment, STEER, key=KEY, episodes=4)
+    for trajectory in trajectories:
+        np.testing.assert_array_equal(trajectory.states[:, 0], np.arange(10))
+        np.testing.assert_allclose(np.diff(trajectory.states[:, 1]), trajectory.actions[:, 0])
+        assert np.abs(trajectory.actions).max() == 1.0
+        assert not trajectory.terminated
+    assert len({trajectory.states[0, 1] for trajectory in trajectories}) == 4  # each its own seed
+
+
+def test_a_single_object_runs_episode_by_episode_and_stays_open():
+    class Closing(Plain):
+        def close(self):
+            raise AssertionError("closed although it is the user's")
+
+    env = Closing(ends=5)
+    first = rollout(env, STEER, key=KEY, episodes=3, max_steps=20)
+    again = rollout(env, STEER, key=KEY, episodes=3, max_steps=20)
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.states, other.states)
+        assert one.terminated
+        assert len(one) == 5
+    assert first[0].states[0, 1] != first[1].states[0, 1]
+
+
+def test_cart_pole_through_its_own_vector_environment_follows_its_physics():
+    trajectories = rollout("CartPole-v1", Coin(np.array(0.5)), key=KEY, episodes=6)
+    assert len({len(trajectory) for trajectory in trajectories}) > 1
+    single = gymnasium.make("CartPole-v1").unwrapped
+    for trajectory in trajectories:
+        assert trajectory.terminated
+        assert trajectory.actions.dtype == np.int64
+        assert trajectory.total_reward == len(trajectory)
+        for state, action, after in zip(trajectory.states[:-1], trajectory.actions, trajectory.states[1:], strict=True):
+            single.reset()
+            single.state = state
+            np.testing.assert_allclose(single.step(action)[0], after, atol=1e-5)
+
+
+def test_returns_through_the_interface_are_those_of_the_rollout():
+    result = returns("CartPole-v1", Coin(np.array(0.5)), key=KEY, episodes=130)  # more than run side by side
+    trajectories = rollout("CartPole-v1", Coin(np.array(0.5)), key=KEY, episodes=130)
+    np.testing.assert_array_equal(result.steps, [len(t) for t in trajectories])
+    np.testing.assert_array_equal(result.total, [t.total_reward for t in trajectories])
+    assert len({t.states[0, 0] for t in trajectories}) == 130
+
+
+def test_a_policy_that_is_an_ordinary_object_is_asked_one_observation_at_a_time():
+    class Stubborn:
+        def sample(self, key, observation):
+            return 2 if observation < 24 else 0
+
+    trajectory = rollout("gridworld", Stubborn(), key=KEY, episodes=1, max_steps=40)[0]
+    assert set(trajectory.actions) == {2}
+    assert trajectory.states[-1] == 22  # straight down from the centre
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (Plain(bad_observation=3), "Plain: .*NaN or infinity at step 3"),
+        (Plain(bad_observation=0), "Plain: .*NaN or infinity at its reset"),
+        (Plain(bad_reward=4), "Plain: .*NaN or infinity at step 4"),
+        (Plain(fails=5), "Plain failed at step 5: RuntimeError: the motor is on fire"),
+    ],
+)
+def test_an_environment_that_goes_wrong_is_named_with_the_step(env, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        rollout(env, STEER, key=KEY, episodes=1, max_steps=9)
+    if env.fails:
+        assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+def test_a_policy_that_returns_nan_is_named():
+    with pytest.raises(ValueError, match="policy Gaussian: expected finite actions"):
+        rollout(Plain(), Gaussian(np.array([np.nan]), np.ones(1)), key=KEY, episodes=1, max_steps=9)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"episodes": 0}, "episodes: expected an integer ≥ 1, got 0"),
+        ({"episodes": 2.5}, "episodes"),
+        ({"max_steps": 0}, "max_steps: expected an integer ≥ 1, got 0"),
+        ({"max_steps": None}, "Plain states no time limit"),
+        ({"key": 3}, "key: expected a JAX random key, got int"),
+        ({"policy": object()}, "policy: expected an object with sample"),
+    ],
+)
+@pytest.mark.parametrize("run", [rollout, returns])
+def test_bad_arguments_are_named(run, options, message):
+    arguments = {"environment": Plain(), "policy": STEER, "key": KEY, "episodes": 1, "max_steps": 3} | options
+    with pytest.raises(ValueError, match=message):
+        run(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("environment", "limit"), [("bicycle", 50), ("CartPole-v1", 500), (gymnasium.wrappers.TimeLimit(Plain(), 4), 4)]
+)
+def test_the_time_limit_is_the_environments_own(environment, limit):
+    assert rollouts.step_limit(environment) == limit
