@@ -63,7 +63,7 @@ def run_figure(learner: Learner) -> Figure:
     return figure
 
 
-def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, shape: tuple[int, int]) -> None:
+def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, shape: Any) -> None:
     """Mean value on arrival in each cell; cells never entered stay blank."""
     size = shape[0] * shape[1]
     counts = np.bincount(steps.next_states, minlength=size)
@@ -75,7 +75,7 @@ def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, shape: tup
     axes.set_yticks(range(shape[0]), [str(i + 1) for i in range(shape[0])])
 
 
-def _cloud(steps: Transitions, values: np.ndarray, axes: Axes, shape: None) -> None:
+def _cloud(steps: Transitions, values: np.ndarray, axes: Axes, shape: Any) -> None:
     first, second = steps.next_states.T
     points = axes.scatter(first, second, c=values, s=4, cmap="viridis")
     axes.figure.colorbar(points, ax=axes, shrink=0.8)
