@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from bayespbrl.kernels import as_periods, median_bandwidths, radial_basis
 

@@ -8,7 +8,8 @@ kernel matrix into one matrix product.
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from jax import Array
+from numpy.typing import ArrayLike
 
 ROWS_AT_A_TIME = 1024  # keeps a block of a wide kernel matrix in the processor's cache between its three passes
 
@@ -59,7 +60,9 @@ def radial_basis(points: np.ndarray, centres: np.ndarray, bandwidths: np.ndarray
     return squared_exponential(coordinates(points, period) * scale, coordinates(centres, period) * scale)
 
 
-def radial_basis_row(point: ArrayLike, centres: ArrayLike, bandwidths: ArrayLike, period: ArrayLike) -> jnp.ndarray:
+def radial_basis_row(
+    point: Array, centres: Array | np.ndarray, bandwidths: Array | np.ndarray, period: Array | np.ndarray
+) -> Array:
     """`radial_basis` of one point (S,), traceable by JAX; shape (D,)."""
     bandwidths, period = jnp.asarray(bandwidths), jnp.asarray(period)
     difference = jnp.asarray(point) - jnp.asarray(centres)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import Space
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from bayespbrl.kernels import (
     as_periods,

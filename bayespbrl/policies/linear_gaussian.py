@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import Space
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from bayespbrl.policies.samples import weighted_samples
 from bayespbrl.policies.spaces import centre_and_range, dimension

@@ -18,8 +18,11 @@ class Policy(Protocol):
     """
 
     @classmethod
-    def initial(cls, observation_space: Space, action_space: Space, **options: Any) -> Self:
-        """The policy before any fit. `ValueError` where the spaces do not suit this kind of policy."""
+    def initial(cls, observation_space: Space, action_space: Space) -> Self:
+        """The policy before any fit; keyword options are each policy's own.
+
+        `ValueError` where the spaces do not suit this kind of policy.
+        """
         ...
 
     def sample(self, key: Array, observation: Any) -> Any:
