@@ -4,7 +4,8 @@
 
 One row a policy and N. Weights are those of a relative entropy update with bound 0.35 towards a known target, so that
 "gain" can say which share of the update the fitted policy took over: the rise of the expected objective under the new
-policy over that under the weighted samples. Run on an idle machine: the numerical libraries' threads do not share well.
+policy over that under the weighted samples. Run on an idle machine, or with OPENBLAS_NUM_THREADS=1: the threads of
+several processes' linear algebra wait for each other, and a fit then takes ten times as long.
 """
 
 import argparse
