@@ -1,6 +1,7 @@
 """Actor-critic REPS: sample weights that raise Q within a KL bound (paper, step 2, eqs. 11-13)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -133,14 +134,14 @@ def _solve_dual(
 ) -> tuple[float, np.ndarray, bool, str]:
     """Minimise g(η, v) = ηε + η log Σ Wᵢ exp((Qᵢ − vᵀφᵢ)/η) (eq. 13 with φ̂ = 0) over η ≥ floor and v."""
     rank = features.shape[1]
-    unknown = ca.MX.sym("eta_and_v", 1 + rank)
+    unknown: Any = ca.MX.sym("eta_and_v", 1 + rank)
     eta = unknown[0]
-    advantage = ca.DM(q_values)
+    advantage: Any = ca.DM(q_values)
     if rank:
         advantage = advantage - ca.mtimes(ca.DM(features), unknown[1:])
     logits = ca.DM(np.log(base_weights)) + advantage / eta
     dual = eta * kl_bound + eta * ca.logsumexp(logits)
-    options = {
+    options: dict[str, Any] = {
         "print_time": False,
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
@@ -149,7 +150,8 @@ def _solve_dual(
         "ipopt.tol": 1e-8,
         "ipopt.max_iter": 500,
     }
-    solver = ca.nlpsol("reps_dual", "ipopt", {"x": unknown, "f": dual}, options)
+    problem: Any = {"x": unknown, "f": dual}
+    solver = ca.nlpsol("reps_dual", "ipopt", problem, options)
     lower = np.concatenate([[TEMPERATURE_FLOOR], np.full(rank, -np.inf)])
     start = np.concatenate([[1.0], np.zeros(rank)])
     solution = np.asarray(solver(x0=start, lbx=lower, ubx=np.inf)["x"]).ravel()
