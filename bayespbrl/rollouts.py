@@ -66,11 +66,12 @@ def rollout(
     with jax.enable_x64(True):
         run = _simulate(dynamics, policy, key, episodes=episodes, steps=steps)
         observations, actions, rewards, terminated, lengths = (np.asarray(part) for part in run)
-    trajectories = []
-    for states, acts, signal, ended, length in zip(observations, actions, rewards, terminated, lengths, strict=True):
-        _require_finite(env, states[: length + 1], signal[:length])
-        trajectories.append(Trajectory(states[: length + 1], acts[:length], signal[:length], bool(ended)))
-    return tuple(trajectories)
+    if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
+        raise ValueError(_not_finite(env, _first_not_finite(observations, rewards)))
+    return tuple(
+        Trajectory(states[: length + 1], acts[:length], signal[:length], bool(ended))
+        for states, acts, signal, ended, length in zip(observations, actions, rewards, terminated, lengths, strict=True)
+    )
 
 
 def returns(environment: Any, policy: Any, *, key: jax.Array, episodes: int, max_steps: int | None = None) -> Returns:
@@ -147,11 +148,11 @@ def _is_pytree(policy: Any) -> bool:
     return all(isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int) for leaf in jax.tree.leaves(policy))
 
 
-def _require_finite(env: gymnasium.Env, states: np.ndarray, rewards: np.ndarray) -> None:
-    bad = ~np.isfinite(states).reshape(len(states), -1).all(axis=1)
-    bad[1:] |= ~np.isfinite(rewards)
-    if bad.any():
-        raise ValueError(_not_finite(env, int(np.argmax(bad))))
+def _first_not_finite(observations: np.ndarray, rewards: np.ndarray) -> int:
+    """The earliest bad step over all episodes; 0 is the reset."""
+    bad = ~np.isfinite(observations).reshape(*observations.shape[:2], -1).all(axis=2)
+    bad[:, 1:] |= ~np.isfinite(rewards)
+    return int(np.argmax(bad.any(axis=0)))
 
 
 def _not_finite(env: gymnasium.Env, step: int) -> str:

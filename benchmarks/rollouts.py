@@ -74,24 +74,29 @@ def compiled_steps_per_second(name: str, policy: Any, run: Any, episodes: int, s
 def interface_steps_per_second(name: str, policy: Any, seconds: float) -> float:
     """The same policy, jitted, and the registered environment, one step at a time."""
     env = open_environment(name)
-    sample = jax.jit(lambda key, observation: policy.sample(key, observation))
+    sample = jax.jit(lambda policy, key, observation: policy.sample(key, observation))
     split = jax.jit(jax.random.split)
-    steps, start, warm = 0, 0.0, 20
-    with jax.enable_x64(True):
-        key = jax.random.key(0)
-        observation, _ = env.reset(seed=0)
-        while steps < warm or time.perf_counter() - start < seconds:
-            if steps == warm:
-                start = time.perf_counter()
+    key = jax.random.key(0)
+    observation, _ = env.reset(seed=0)
+
+    def steps_in(seconds: float) -> int:
+        nonlocal key, observation
+        steps, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
             key, action_key = split(key)
-            action = np.asarray(sample(action_key, observation))
+            action = np.asarray(sample(policy, action_key, observation))
             if isinstance(env.action_space, Box):
                 action = np.clip(action, env.action_space.low, env.action_space.high)
             observation, _, terminated, truncated, _ = env.step(action)
             steps += 1
             if terminated or truncated:
                 observation, _ = env.reset()
-        return (steps - warm) / (time.perf_counter() - start)
+        return steps
+
+    with jax.enable_x64(True):
+        policy = jax.tree.map(jnp.asarray, policy)
+        steps_in(0.5)  # compiles
+        return steps_in(seconds) / seconds
 
 
 def main() -> None:

@@ -143,9 +143,9 @@ class Bicycle(FunctionalEnv):
     ## Action space
     `Box((2,), float64)`. Noise U(−0.02, 0.02) m is added to the displacement.
 
-    | Num | Action                                            | Min   | Max  | Unit |
-    |-----|---------------------------------------------------|-------|------|------|
-    | 0   | torque on the handlebar                           | -2    | 2    | N m  |
+    | Num | Action                                             | Min   | Max  | Unit |
+    |-----|----------------------------------------------------|-------|------|------|
+    | 0   | torque on the handlebar                            | -2    | 2    | N m  |
     | 1   | displacement of the rider from the bicycle's plane | -0.02 | 0.02 | m    |
 
     ## Observation space

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-COLUMNS = 10
+COLUMNS = 6
 MAX_POSES = 30
 
 
@@ -20,7 +20,7 @@ def draw_pose(lines: Sequence[np.ndarray], axes: Any, *, offset: Any = (0.0, 0.0
 def draw_film_strip(
     pose: Callable[[Any], Sequence[np.ndarray]], states: np.ndarray, axes: Any, *, step_seconds: float
 ) -> None:
-    """At most 30 poses, first and last among them, ten a row, each with its time.
+    """At most 30 poses, first and last among them, six a row, each with its time.
 
     Args:
       pose: the polylines of one observation, in the square [−1, 1]².

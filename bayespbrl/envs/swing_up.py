@@ -103,8 +103,8 @@ class SwingUp(FunctionalEnv):
     ## Action space
     `Box(-30, 30, (1,), float64)`. N(0, 4.47²) N m are added to the torque, and the sum is clipped to the same range.
 
-    | Num | Action             | Min | Max | Unit |
-    |-----|--------------------|-----|-----|------|
+    | Num | Action              | Min | Max | Unit |
+    |-----|---------------------|-----|-----|------|
     | 0   | torque at the pivot | -30 | 30  | N m  |
 
     ## Observation space
