@@ -6,6 +6,7 @@ from bayespbrl.preferences import Answer, Preferences, Query
 from bayespbrl.runs import Run, load, resume, start
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility import infer_utility
 
 __all__ = [
     "Answer",
@@ -18,6 +19,7 @@ __all__ = [
     "Settings",
     "TerminalExpert",
     "Trajectory",
+    "infer_utility",
     "load",
     "resume",
     "start",

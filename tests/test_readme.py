@@ -1,0 +1,36 @@
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", EXAMPLES, ids=[f"example-{number}" for number in range(1, len(EXAMPLES) + 1)])
+def test_every_example_of_the_readme_runs_as_printed(example, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "README.md", "exec"), {})
+    assert capsys.readouterr().out
+
+
+def test_the_first_example_takes_ten_lines():
+    assert 1 <= len([line for line in EXAMPLES[0].splitlines() if line.strip()]) <= 10
+
+
+def test_the_map_of_the_house_names_every_module_and_nothing_else():
+    drawn = re.search(r"```\nbayespbrl/(.*?)```", README, flags=re.DOTALL).group(1)
+    named = set(re.findall(r"\b(\w+)\.py\b", drawn))
+    there = {file.stem for file in (ROOT / "bayespbrl").glob("*.py") if not file.stem.startswith("__")}
+    assert named == there
+    for folder in (ROOT / "bayespbrl").iterdir():
+        if folder.is_dir() and not folder.name.startswith("__"):
+            assert f"  {folder.name}/" in drawn
+
+
+def test_every_link_to_a_file_leads_somewhere():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
