@@ -228,6 +228,23 @@ def test_the_search_never_returns_worse_than_its_start_and_repeats_itself():
     np.testing.assert_allclose(found(1).hyperparameters.logarithms, start.logarithms)
 
 
+def test_the_search_keeps_a_good_start_that_one_bold_generation_cannot_beat():
+    points, targets, weights = some_samples(300, np.random.default_rng(14))
+    options = {
+        "reference": Hyperparameters(2 * BANDWIDTHS, 80.0, 80.0),
+        "minimum_noise_variance": 1.0,
+        "period": PERIOD,
+    }
+    start = Hyperparameters(BANDWIDTHS, SIGNAL, NOISE)
+    seed = np.random.default_rng(0)
+    good = search(points, targets, weights, start=start, rng=seed, evaluations=200, **options).hyperparameters
+    rng = np.random.default_rng(1)
+    bold = search(points, targets, weights, start=good, rng=rng, step_size=2.0, evaluations=10, **options)
+    assert bold.evaluations > 1
+    assert bold.objective == bold.start_objective
+    np.testing.assert_allclose(bold.hyperparameters.logarithms, good.logarithms)
+
+
 def test_held_out_objective_is_the_full_process_on_the_other_half():
     rng = np.random.default_rng(15)
     points, targets, weights = some_samples(30, rng)
