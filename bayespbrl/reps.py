@@ -75,8 +75,10 @@ def reps_weights(
     whitened, unwhiten = _whiten(state_features, base_weights, rank_tolerance)
     mean = base_weights @ q_values
     spread = np.sqrt(base_weights @ (q_values - mean) ** 2)
-    scale = spread if spread > 1e-12 * max(1.0, np.abs(mean)) else 1.0
-    standardised = (q_values - mean) / scale
+    # what LSTD's penalties leave of a constant Q is noise, and must not be blown up to the size of the bound
+    informative = spread > 1e-8 * np.abs(mean)
+    scale = spread if informative else 1.0
+    standardised = (q_values - mean) / scale if informative else np.zeros_like(q_values)
     temperature, dual, converged, status = _solve_dual(standardised, whitened, base_weights, kl_bound)
     logits = np.log(base_weights) + (standardised - whitened @ dual) / temperature  # (eq. 12)
     probabilities = np.exp(logits - np.max(logits))

@@ -1,0 +1,199 @@
+"""Step 2: on a small discrete problem with a known model, and once with continuous actions."""
+
+import jax
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+
+from bayespbrl import improvement
+from bayespbrl.features import OneHot, StateActionProduct
+from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, TabularPolicy, sample_actions
+from bayespbrl.trajectories import Trajectory, Transitions, transitions
+
+STATES, ACTIONS, DISCOUNT = 6, 3, 0.9
+OPTIONS = {"discount": DISCOUNT, "fixed_point_ridge": 1e-8, "projection_ridge": 1e-8}
+
+
+def model(seed=0):
+    """P(s′|s, a), shape (S, A, S), and the reward of the next state, shape (S,)."""
+    rng = np.random.default_rng(seed)
+    return rng.dirichlet(np.full(STATES, 0.3), size=(STATES, ACTIONS)), rng.normal(size=STATES)
+
+
+def walk(table, policy, rng, steps=4000, terminated=False):
+    states, actions = [0], []
+    for _ in range(steps):
+        actions.append(rng.choice(ACTIONS, p=policy.table[states[-1]]))
+        states.append(rng.choice(STATES, p=table[states[-1], actions[-1]]))
+    rewards = np.zeros(steps)
+    return Trajectory(np.array(states), np.array(actions), rewards, terminated)
+
+
+def improve(policy, steps, utilities, **changes):
+    options = {
+        "key": jax.random.key(1),
+        "rng": np.random.default_rng(1),
+        "action_space": Discrete(ACTIONS),
+        "state_features": OneHot(STATES),
+        "state_action_features": StateActionProduct(OneHot(STATES), ACTIONS),
+        "kl_bound": 0.3,
+        **OPTIONS,
+    }
+    return improvement.improve(policy, steps, utilities, **(options | changes))
+
+
+def random_policy(seed=4):
+    return TabularPolicy(np.random.default_rng(seed).dirichlet(np.ones(ACTIONS), STATES))
+
+
+def random_steps(seed=3, steps=400, terminated=False):
+    table, reward = model()
+    taken = transitions([walk(table, random_policy(), np.random.default_rng(seed), steps, terminated)])
+    return taken, reward[taken.next_states]
+
+
+def test_q_of_counted_steps_is_that_of_the_uncounted_ones(monkeypatch):
+    steps, utilities = random_steps(terminated=True)
+    utilities = utilities + 0.1 * np.random.default_rng(0).normal(size=len(steps))  # not a function of the state
+    counted = improve(random_policy(), steps, utilities)
+    assert len(improvement._counted(steps, utilities)[0]) < len(steps) / 2
+    monkeypatch.setattr(improvement, "_counted", lambda steps, utilities: (steps, utilities, np.ones(len(steps))))
+    uncounted = improve(random_policy(), steps, utilities)
+    np.testing.assert_allclose(counted.q_function.weights, uncounted.q_function.weights, atol=1e-6)
+    np.testing.assert_allclose(counted.policy.table, uncounted.policy.table, atol=1e-6)
+
+
+def test_q_is_that_of_the_policy_under_the_observed_frequencies():
+    # One-hot features make LSTD exact: Q = r + γ P̂ π Q with the empirical P̂.
+    steps, utilities = random_steps(steps=3000)
+    policy = random_policy()
+    counts = np.zeros((STATES * ACTIONS, STATES))
+    np.add.at(counts, (steps.states * ACTIONS + steps.actions, steps.next_states), 1)
+    assert (counts.sum(axis=1) > 0).all()
+    frequencies = counts / counts.sum(axis=1, keepdims=True)
+    means = np.bincount(steps.states * ACTIONS + steps.actions, utilities) / counts.sum(axis=1)
+    following = (frequencies[:, :, None] * policy.table).reshape(STATES * ACTIONS, -1)
+    exact = np.linalg.solve(np.eye(STATES * ACTIONS) - DISCOUNT * following, means)
+    states, actions = np.divmod(np.arange(STATES * ACTIONS), ACTIONS)
+    np.testing.assert_allclose(improve(policy, steps, utilities).q_function(states, actions), exact, atol=1e-5)
+
+
+def test_nothing_follows_a_terminal_state():
+    # 0 → 1 → terminal 2, each step worth 1: Q(1, ·) = 1, Q(0, ·) = 1 + γ.
+    trajectory = Trajectory(np.array([0, 1, 2]), np.array([0, 0]), np.zeros(2), terminated=True)
+    steps = transitions([trajectory] * 5)
+    q_function = improve(TabularPolicy(np.eye(ACTIONS)[np.zeros(STATES, int)]), steps, np.ones(10)).q_function
+    np.testing.assert_allclose(q_function(np.array([0, 1]), np.array([0, 0])), [1 + DISCOUNT, 1], atol=1e-6)
+
+
+def test_base_weights_are_policy_times_share_of_visits(monkeypatch):
+    seen = {}
+
+    def spy(q_values, features, base_weights, *, kl_bound):
+        seen.update(features=features, base_weights=base_weights)
+        return reps_weights(q_values, features, base_weights, kl_bound=kl_bound)
+
+    reps_weights = improvement.reps_weights
+    monkeypatch.setattr(improvement, "reps_weights", spy)
+    steps, utilities = random_steps(steps=50)
+    table = random_policy().table.copy()
+    table[2] = [0.25, 0.75, 0]  # an action that the policy excludes needs no weight
+    improve(TabularPolicy(table), steps, utilities)
+    visits = np.bincount(steps.states, minlength=STATES) / len(steps)
+    expected = (visits[:, None] * table)[visits > 0].ravel()
+    np.testing.assert_allclose(seen["base_weights"], expected[expected > 0], rtol=1e-12)
+    np.testing.assert_allclose(seen["base_weights"] @ seen["features"], visits, atol=1e-12)
+    assert seen["base_weights"].sum() == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("kl_bound", [0.05, 0.3])
+def test_the_kl_of_the_fitted_table_is_that_of_reps_and_the_bound(kl_bound):
+    steps, utilities = random_steps()
+    update = improve(random_policy(), steps, utilities, kl_bound=kl_bound)
+    assert update.reps.bound_active
+    assert update.reps.kl == pytest.approx(kl_bound, rel=1e-4)
+    assert update.kl_fitted_policy == pytest.approx(update.reps.kl, rel=1e-5)
+    visits = np.bincount(steps.states, minlength=STATES) / len(steps)
+    new, old = update.policy.table, random_policy().table
+    assert update.kl_fitted_policy == pytest.approx(visits @ np.sum(new * np.log(new / old), axis=1), rel=1e-9)
+    assert update.entropy == pytest.approx(-visits @ np.sum(new * np.log(new), axis=1), rel=1e-9)
+
+
+def test_a_constant_utility_changes_nothing():
+    steps, _ = random_steps()
+    update = improve(random_policy(), steps, np.full(len(steps), 2.5))
+    np.testing.assert_allclose(update.policy.table, random_policy().table, atol=1e-6)
+    assert not update.reps.bound_active
+
+
+def test_states_never_visited_keep_their_row():
+    trajectory = Trajectory(np.array([0, 1, 0, 1, 1]), np.array([0, 1, 2, 1]), np.zeros(4))
+    update = improve(random_policy(), transitions([trajectory]), np.array([1.0, 0, 2, 0.5]))
+    np.testing.assert_array_equal(update.policy.table[2:], random_policy().table[2:])
+    assert not np.allclose(update.policy.table[:2], random_policy().table[:2])
+
+
+def test_repeated_improvement_with_the_reward_finds_the_policy_of_value_iteration():
+    table, reward = model(seed=6)
+    values = np.zeros(STATES)
+    for _ in range(1000):
+        optimal_q = table @ (reward + DISCOUNT * values)
+        values = optimal_q.max(axis=1)
+    gaps = np.sort(optimal_q, axis=1)
+    assert (gaps[:, -1] - gaps[:, -2] > 0.02).all()  # the optimum is unique, and its margin above the noise of P̂
+    rng, policy = np.random.default_rng(0), TabularPolicy(np.full((STATES, ACTIONS), 1 / ACTIONS))
+    steps = transitions([walk(table, policy, rng, 40_000)])
+    for _ in range(12):
+        update = improve(policy, steps, reward[steps.next_states], kl_bound=0.5)
+        policy = update.policy
+    np.testing.assert_array_equal(policy.table.argmax(axis=1), optimal_q.argmax(axis=1))
+    assert policy.table.max(axis=1).min() > 0.95
+
+
+@pytest.mark.parametrize(
+    "utilities", [np.zeros(3), np.full(400, np.nan), np.r_[np.zeros(399), np.inf], np.zeros((400, 1))]
+)
+def test_utilities_that_do_not_fit_or_are_not_finite_are_refused(utilities):
+    with pytest.raises(ValueError, match="utilities: expected 400 finite numbers"):
+        improve(random_policy(), random_steps()[0], utilities)
+
+
+OBSERVATIONS, FORCES = Box(-1.0, 1.0, (2,)), Box(-2.0, 1.0, (1,))
+
+
+def quadratic(states, actions):
+    """Features that hold Q = −(a − ½s₀)² exactly."""
+    return np.column_stack([actions**2, actions * states[:, :1], states**2])
+
+
+@pytest.mark.parametrize("kind", [LinearGaussianPolicy, pytest.param(GaussianProcessPolicy, marks=pytest.mark.slow)])
+def test_a_continuous_policy_moves_towards_the_better_actions(kind):
+    rng = np.random.default_rng(2)
+    policy = kind.initial(OBSERVATIONS, FORCES, initial_scale=0.2)
+    states = rng.uniform(-1, 1, size=(500, 2))
+    actions = improvement.clipped(sample_actions(policy, jax.random.key(0), states), FORCES)
+    steps = Transitions(states, actions, rng.uniform(-1, 1, (500, 2)), np.zeros(500), np.ones(500, bool))
+    best = 0.5 * states[:, 0]
+    before = np.mean((actions[:, 0] - best) ** 2)
+    update = improve(
+        policy,
+        steps,
+        -((actions[:, 0] - best) ** 2),
+        action_space=FORCES,
+        state_features=lambda s: np.column_stack([s, s**2]),
+        state_action_features=quadratic,
+        discount=0.0,
+        kl_bound=0.5,
+    )
+    np.testing.assert_allclose(update.q_function(states, actions), -((actions[:, 0] - best) ** 2), atol=1e-5)
+    assert update.reps.bound_active
+    assert update.reps.feature_gap < 1e-6
+    assert 0.1 < update.kl_fitted_policy < 1.0
+    after = sample_actions(update.policy, jax.random.key(5), states)[:, 0]
+    assert np.mean((after - best) ** 2) < 0.6 * before
+    assert type(update.policy) is kind
+
+
+def test_continuous_actions_are_kept_within_the_bounds_and_discrete_ones_as_they_are():
+    np.testing.assert_array_equal(improvement.clipped(np.array([[-5.0], [0.3], [5.0]]), FORCES), [[-2], [0.3], [1]])
+    np.testing.assert_array_equal(improvement.clipped(np.array([0, 2]), Discrete(3)), [0, 2])

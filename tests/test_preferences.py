@@ -1,0 +1,67 @@
+"""Comparison rule of the authors' implementation; ψ differences of eq. 5."""
+
+import numpy as np
+import pytest
+
+from bayespbrl.preferences import Answer, Preferences, pair_differences, parse_answer
+
+
+def test_a_better_newcomer_is_preferred_over_every_undominated_one_and_replaces_them():
+    before = Preferences(pairs=((0, 5),), undominated=(0, 2, 3), answers=4)
+    after = before.add(7, 3, preferred=7)
+    assert after == Preferences(((0, 5), (7, 0), (7, 2), (7, 3)), (7,), 5)
+
+
+def test_every_undominated_one_is_preferred_over_a_worse_newcomer():
+    before = Preferences(undominated=(0, 2, 3), answers=4)
+    assert before.add(7, 3, preferred=3) == Preferences(((0, 7), (2, 7), (3, 7)), (0, 2, 3), 5)
+
+
+def test_a_tie_joins_the_undominated_and_stores_no_pair():
+    before = Preferences(pairs=((0, 5),), undominated=(0,), answers=1)
+    assert before.add(7, 0, preferred=None) == Preferences(((0, 5),), (0, 7), 2)
+
+
+def test_five_answers_by_hand():
+    # 0 is the first; 1 better; 2 ties with 1; 3 worse than both; 4 ties with 2; 5 better than 1, 2 and 4.
+    preferences = Preferences().start(0)
+    for newcomer, incumbent, preferred in [(1, 0, 1), (2, 1, None), (3, 2, 2), (4, 2, None), (5, 4, 5)]:
+        preferences = preferences.add(newcomer, incumbent, preferred=preferred)
+    assert preferences.pairs == ((1, 0), (1, 3), (2, 3), (5, 1), (5, 2), (5, 4))
+    assert preferences.undominated == (5,)
+    assert preferences.answers == 5  # ties count as answers, but not as pairs
+
+
+@pytest.mark.parametrize(("incumbent", "preferred"), [(0, 0), (9, 9), (3, 0)])
+def test_a_comparison_with_another_than_the_newest_undominated_one_is_refused(incumbent, preferred):
+    before = Preferences(undominated=(0, 3))
+    with pytest.raises(ValueError, match=r"incumbent: expected|preferred: expected"):
+        before.add(7, incumbent, preferred=preferred)
+    with pytest.raises(ValueError, match="incumbent: expected"):
+        Preferences().add(7, 0, preferred=7)
+
+
+def test_differences_are_preferred_minus_dominated():
+    features = np.array([[1.0, 2.0, 4.0], [0.5, -1.0, 3.0], [7.0, 0.0, 1.0]])
+    differences = Preferences(pairs=((0, 1), (2, 0))).differences(features)
+    np.testing.assert_array_equal(differences, [[0.5, 3.0, 1.0], [6.0, -2.0, -3.0]])
+
+
+def test_differences_of_no_pair_and_of_one_are_matrices():
+    features = np.arange(12.0).reshape(4, 3)
+    assert Preferences().differences(features).shape == (0, 3)
+    np.testing.assert_array_equal(pair_differences([(3, 1)], features), [[6.0, 6.0, 6.0]])
+
+
+@pytest.mark.parametrize("pair", [(0, 4), (-1, 2), (2, 2)])
+def test_a_pair_of_trajectories_that_are_not_there_or_the_same_is_refused(pair):
+    with pytest.raises(ValueError, match="pairs: expected"):
+        pair_differences([(0, 1), pair], np.zeros((4, 3)))
+
+
+def test_answers_are_recognised_and_anything_else_is_refused_by_name():
+    assert parse_answer("tie") is Answer.TIE
+    assert parse_answer(Answer.UNDO) is Answer.UNDO
+    for nonsense in ("both", 1, None, "FIRST", ["first"], float("nan")):
+        with pytest.raises(ValueError, match="expert: expected one of 'first'"):
+            parse_answer(nonsense)

@@ -1,0 +1,77 @@
+"""Settings: every bad value is refused with its name, what was expected and what came."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from bayespbrl.settings import PRESETS, Settings, settings_for
+
+NAN, INFINITY = float("nan"), float("inf")
+BAD = {
+    "utility": ["posterior", "", None, 3],
+    "likelihood": ["eq8", None],
+    "policy": ["neural", None],
+    "features": ["mine"],
+    "expert": ["oracle"],
+    "iterations": [0, -3, 2.0, True, "25", None, NAN],
+    "kl_bound": [0, 0.0, -0.1, NAN, INFINITY, True, "0.3", None],
+    "prior_scale": [0, -1.0, NAN, INFINITY, False],
+    "steepness": [0, -5, NAN, -INFINITY],
+    "bandwidth_factor": [0, NAN],
+    "initial_action_scale": [0, -0.5, NAN],
+    "fixed_point_ridge": [-1e-8, NAN, True],
+    "projection_ridge": [-1e-8, INFINITY],
+    "lapse_rate": [-0.1, 1.0, NAN, True],
+    "discount": [1.0, -0.5, NAN, "0.98"],
+    "wrong_answers": [-0.1, 1.1, NAN, True],
+    "seed": [-1, 1.0, True, NAN, None],
+    "trajectories_per_iteration": [0, 1, 2.5],
+    "queries_per_iteration": [0, 11, True],
+    "first_queries": [0, 10, 1.5],
+    "evaluation_episodes": [0, NAN],
+    "centres": [0, -300, 1.5],
+    "max_steps": [0, -1, True, 10.0],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in BAD.items() for value in values])
+def test_a_bad_value_is_refused_with_name_expected_and_got(name, value):
+    with pytest.raises(ValueError, match=rf"^{name}: expected .*, got ") as refusal:
+        Settings("gridworld", **{name: value})
+    assert repr(value)[:20] in str(refusal.value)
+
+
+def test_every_option_is_checked():
+    assert {field.name for field in dataclasses.fields(Settings)} == {"env", *BAD}
+
+
+def test_the_defaults_are_the_papers_protocol():
+    settings = settings_for("gridworld")
+    assert (settings.iterations, settings.trajectories_per_iteration, settings.discount) == (25, 10, 0.98)
+    assert (settings.first_queries, settings.queries_per_iteration) == (2, 1)  # 26 answers in 25 iterations
+    assert (settings.utility, settings.likelihood, settings.evaluation_episodes) == ("posterior-mean", "mixed", 100)
+
+
+def test_an_unknown_option_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"settings: expected options among .*steepness.*, got kl_bond"):
+        settings_for("gridworld", kl_bond=0.3)
+
+
+def test_changes_win_over_presets_and_none_changes_nothing():
+    preset = settings_for("gridworld")
+    assert settings_for("gridworld", kl_bound=None, seed=None, iterations=None) == preset
+    assert settings_for("gridworld", iterations=7).iterations == 7
+    assert settings_for("SomebodysEnv-v3") == Settings("SomebodysEnv-v3")
+
+
+@pytest.mark.parametrize("env", PRESETS)
+def test_every_preset_is_valid_and_survives_json(env):
+    settings = settings_for(env, seed=5)
+    assert Settings(**json.loads(json.dumps(dataclasses.asdict(settings)))) == settings
+
+
+@pytest.mark.parametrize("value", [1e-6, 1, np.float64(0.3)])
+def test_whole_numbers_and_numpy_floats_are_numbers(value):
+    assert Settings("gridworld", kl_bound=value).kl_bound == value

@@ -1,0 +1,151 @@
+"""Step 1 on small cases: three discrete states, one-hot features, so that ψ can be written down."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+from bayespbrl.features import OneHot
+from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
+from bayespbrl.utility import KnownReward, estimate_utility
+
+METHODS = ("posterior-mean", "most-likely", "linear-program")
+
+
+def staying(state, steps=4, reward=0.0):
+    return Trajectory(np.full(steps + 1, state), np.zeros(steps, dtype=int), np.full(steps, reward))
+
+
+# 0 is the worst state, 2 the best; trajectory 3 is shorter.
+TRAJECTORIES = [staying(0, reward=-1.0), staying(1, reward=0.5), staying(2, reward=2.0), staying(2, 2, reward=2.0)]
+PAIRS = [(1, 0), (2, 1)]
+ONE_HOT = OneHot(3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_answers_are_explained(method):
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method=method, discount=0.9)
+    utilities = estimate.utilities(np.arange(3))
+    assert utilities[0] < utilities[2]
+    assert method == "linear-program" or utilities[0] < utilities[1] < utilities[2]  # one of many optimal corners
+    assert estimate.quality.pairs == 2
+    assert estimate.quality.pairs_satisfied == sum(
+        estimate.utilities(np.array([i]))[0] > estimate.utilities(np.array([j]))[0] for i, j in PAIRS
+    )
+    assert estimate.quality.converged
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_trajectorys_utility_is_the_discounted_sum_of_its_steps(method):
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method=method, discount=0.9)
+    sums = [0.9 ** np.arange(len(t)) @ estimate.step_utilities(transitions([t])) for t in TRAJECTORIES]
+    np.testing.assert_allclose(estimate.trajectory_utilities(TRAJECTORIES), sums, rtol=1e-12)
+
+
+def test_the_utility_of_a_step_is_that_of_its_next_state():
+    steps = transitions([Trajectory(np.array([0, 2, 1]), np.zeros(2, dtype=int), np.zeros(2))])
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="linear-program", discount=0.9)
+    np.testing.assert_array_equal(estimate.step_utilities(steps), estimate.weights[[2, 1]])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_features_in_other_units_give_the_same_utilities(method):
+    plain = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method=method, discount=0.9)
+    scaled = estimate_utility(TRAJECTORIES, PAIRS, lambda s: 1024.0 * ONE_HOT(s), method=method, discount=0.9)
+    np.testing.assert_allclose(scaled.utilities(np.arange(3)), plain.utilities(np.arange(3)), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(1024.0 * scaled.weights, plain.weights, rtol=1e-9, atol=1e-12)
+
+
+def test_without_pairs_the_posterior_mean_is_the_priors_zero_and_nothing_is_claimed():
+    estimate = estimate_utility(TRAJECTORIES, [], ONE_HOT, method="posterior-mean", discount=0.9)
+    np.testing.assert_array_equal(estimate.weights, np.zeros(3))
+    assert (estimate.quality.pairs, estimate.quality.pairs_satisfied) == (0, 0)
+    assert estimate.quality.log_evidence == pytest.approx(0.0, abs=1e-12)
+
+
+def test_without_pairs_every_estimate_is_finite():
+    for method in METHODS:
+        estimate = estimate_utility(TRAJECTORIES, [], ONE_HOT, method=method, discount=0.9)
+        assert np.isfinite(estimate.trajectory_utilities(TRAJECTORIES)).all()
+
+
+def test_a_pair_that_the_features_cannot_tell_apart_is_survived_and_counted_as_unsatisfied():
+    twins = [*TRAJECTORIES, staying(1)]
+    for method in METHODS:
+        estimate = estimate_utility(twins, [(1, 4), (2, 0)], ONE_HOT, method=method, discount=0.9)
+        assert (estimate.quality.pairs, estimate.quality.pairs_satisfied) == (2, 1)
+
+
+def test_with_one_pair_the_posterior_mean_is_along_its_difference_and_matches_quadrature():
+    # K = 1 leaves the sigmoid: w = z·d/|d| with density ∝ N(z; 0, 1) sigmoid(m |d| z), d scaled to (0, −1, 1).
+    estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-mean", discount=0.9, steepness=5.0)
+    scale = np.sum(0.9 ** np.arange(4))
+    z = np.linspace(-10, 10, 20001)
+    density = np.exp(-0.5 * z**2) / (1 + np.exp(-5 * np.sqrt(2) * z))
+    mean = z @ density / density.sum() / np.sqrt(2)
+    np.testing.assert_allclose(scale * estimate.weights, [0, -mean, mean], atol=0.04)
+    assert estimate.weights[0] == 0
+    evidence = np.log(density.sum() * (z[1] - z[0]) / np.sqrt(2 * np.pi))
+    assert estimate.quality.log_evidence == pytest.approx(evidence, abs=0.02)
+
+
+def test_most_likely_explains_the_answers_at_least_as_well_as_the_mean():
+    means, likeliest = (
+        estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method=method, discount=0.9, seed=3) for method in METHODS[:2]
+    )
+    features = trajectory_features(TRAJECTORIES, ONE_HOT, discount=0.9)
+    differences = np.array([features[i] - features[j] for i, j in PAIRS])
+    margins = {e: differences @ w for e, w in (("mean", means.weights), ("most", likeliest.weights))}
+    assert np.sum(np.log1p(np.exp(-5 * margins["most"]))) <= np.sum(np.log1p(np.exp(-5 * margins["mean"])))
+
+
+def test_the_same_seed_gives_the_same_draws_and_another_gives_others():
+    one, same, other = (
+        estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="posterior-mean", discount=0.9, seed=seed)
+        for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(one.weights, same.weights)
+    assert not np.array_equal(one.weights, other.weights)
+
+
+def test_the_linear_program_reaches_the_optimum_that_scipy_finds():
+    rng = np.random.default_rng(8)
+    features = rng.normal(size=(6, 4))
+    trajectories = [staying(number, steps=1) for number in range(6)]  # ψ of trajectory i is row i
+    pairs = [(int(i), int(j)) for i, j in itertools.combinations(rng.permutation(6), 2)]
+    estimate = estimate_utility(trajectories, pairs, lambda s: features[s], method="linear-program", discount=0.9)
+    differences = np.array([features[i] - features[j] for i, j in pairs])
+    differences /= np.abs(differences).max()
+    rows, columns = differences.shape
+    oracle = scipy.optimize.linprog(
+        np.concatenate([np.zeros(columns), -np.ones(rows)]),
+        A_ub=np.block([[-differences, np.eye(rows)], [-2 * differences, np.eye(rows)]]),
+        b_ub=np.zeros(2 * rows),
+        bounds=[(-1, 1)] * columns + [(None, None)] * rows,
+    )
+    scale = np.abs(np.array([features[i] - features[j] for i, j in pairs])).max()
+    margins = differences @ (scale * estimate.weights)
+    assert np.sum(np.minimum(margins, 2 * margins)) == pytest.approx(-oracle.fun, rel=1e-7)
+    assert np.abs(scale * estimate.weights).max() <= 1 + 1e-9
+    assert estimate.quality.converged
+    assert np.isnan(estimate.quality.rhat_max)
+
+
+def test_the_known_reward_is_the_hidden_reward_itself():
+    estimate = estimate_utility(TRAJECTORIES, [(2, 0), (0, 1)], ONE_HOT, method="known-reward", discount=0.9)
+    assert isinstance(estimate, KnownReward)
+    np.testing.assert_array_equal(estimate.step_utilities(transitions(TRAJECTORIES[:2])), [-1] * 4 + [0.5] * 4)
+    np.testing.assert_array_equal(estimate.trajectory_utilities(TRAJECTORIES), [-4, 2, 8, 4])
+    assert (estimate.quality.pairs, estimate.quality.pairs_satisfied) == (2, 1)
+
+
+def test_features_that_are_not_finite_are_refused():
+    for method in METHODS:
+        with pytest.raises(ValueError, match="finite"):
+            estimate_utility(TRAJECTORIES, PAIRS, lambda s: ONE_HOT(s) * np.nan, method=method, discount=0.9)
+
+
+def test_an_unknown_method_is_refused():
+    with pytest.raises(ValueError, match=r"method: expected .*posterior-mean.*got 'median'"):
+        estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="median", discount=0.9)
