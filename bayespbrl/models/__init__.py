@@ -1,6 +1,16 @@
 """Densities and how to sample them."""
 
+from bayespbrl.models.elliptical_slice import EllipticalSlice
 from bayespbrl.models.linear_program import LinearProgramResult, linear_program
 from bayespbrl.models.posterior import restored, sample_posterior, stored
+from bayespbrl.models.preference_model import preference_model
 
-__all__ = ["LinearProgramResult", "linear_program", "restored", "sample_posterior", "stored"]
+__all__ = [
+    "EllipticalSlice",
+    "LinearProgramResult",
+    "linear_program",
+    "preference_model",
+    "restored",
+    "sample_posterior",
+    "stored",
+]

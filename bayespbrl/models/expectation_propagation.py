@@ -1,4 +1,4 @@
-"""Expectation propagation: a Gaussian close to the posterior of z given margins t = L z, and its log evidence (Minka 2001).
+"""Expectation propagation: a Gaussian close to the posterior of z given margins t = L z, and its evidence (Minka 2001).
 
 Each answer's factor p_k(t_k) is replaced by a Gaussian in t_k; all factors are updated at once, damped. It is done in
 NumPy because it is a handful of small dense factorisations, once for each fit.
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import log_ndtr
 
 from bayespbrl.models.likelihoods import ProbitMixture
 
@@ -76,7 +76,7 @@ def expectation_propagation(
       damping: share of each update that is taken, in (0, 1]; halved whenever an update would leave no Gaussian.
       tolerance: change of the margins' moments, in standard deviations, that counts as none.
     """
-    number, rank = loadings.shape
+    number = len(loadings)
     precisions, shifts = np.zeros(number), np.zeros(number)
     gaussian = _moments(loadings, precisions, shifts, prior_scale)
     converged, sweeps = False, 0
@@ -116,7 +116,7 @@ def _moments(loadings, precisions, shifts, prior_scale):
 
 
 def _log_evidence(gaussian, precisions, shifts, mixture):
-    """log Z = Σ_k [log Z_k(cavity) − log ∫ cavity · site] + log ∫ prior · sites (Rasmussen & Williams 2006, eq. 3.65)."""
+    """Σ_k [log Z_k(cavity) − log ∫ cavity · site] + log ∫ prior · sites (Rasmussen & Williams 2006, eq. 3.65)."""
     _, _, t_mean, t_variance, log_normaliser = gaussian
     cavity = 1 / np.maximum(1 - t_variance * precisions, 1e-10)
     variance, mean = t_variance * cavity, (t_mean - t_variance * shifts) * cavity

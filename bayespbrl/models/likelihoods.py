@@ -15,7 +15,10 @@ import numpy as np
 
 
 class ProbitMixture(NamedTuple):
-    """p(t) = constant + Σⱼ weights[j] Φ((t − offsets[j]) / scales[j]); a scale of 0 is the step with value ½ at its offset."""
+    """p(t) = constant + Σⱼ weights[j] Φ((t − offsets[j]) / scales[j]); a scale of 0 is a step with ½ at its offset.
+
+    `constant` may be (K,) and `weights` (K, J) where the answers are of different kinds.
+    """
 
     constant: float | np.ndarray
     weights: np.ndarray
@@ -25,10 +28,13 @@ class ProbitMixture(NamedTuple):
 
 @runtime_checkable
 class Likelihood(Protocol):
-    """The probability of the answer that was given, as a function of its margin."""
+    """The probability of the answer that was given, as a function of its margin; a JAX pytree."""
 
-    def log_prob(self, margins: jax.Array) -> jax.Array:
-        """log p(answer | t), elementwise; JAX-traceable, dtype of `margins`."""
+    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(e, q) with p(answer | t) = exp(e) q, elementwise, e ≤ 0 and q never much below 1/(2K).
+
+        The product of the q over some dozens of answers cannot underflow, so their logarithm is taken once.
+        """
         ...
 
     def probit_mixture(self) -> ProbitMixture:
@@ -36,9 +42,24 @@ class Likelihood(Protocol):
         ...
 
 
+def log_prob(likelihood: Likelihood, margins: jax.Array) -> jax.Array:
+    """log p(answer | t), elementwise; JAX-traceable, in the dtype of `margins`."""
+    exponent, ratio = likelihood.factor(margins)
+    return exponent + jnp.log(ratio)
+
+
+def total_log_prob(likelihood: Likelihood, margins: jax.Array, used: jax.Array) -> jax.Array:
+    """Σ log p over the answers where `used`, margins of shape (..., K). One logarithm for 32 answers: it costs most."""
+    exponent, ratio = likelihood.factor(margins)
+    exponent, ratio = jnp.where(used, exponent, 0), jnp.where(used, ratio, 1)
+    ratio = jnp.pad(ratio, [(0, 0)] * (ratio.ndim - 1) + [(0, -ratio.shape[-1] % 32)], constant_values=1)
+    groups = jnp.prod(ratio.reshape(*ratio.shape[:-1], -1, 32), axis=-1)
+    return jnp.sum(exponent, axis=-1) + jnp.sum(jnp.log(groups), axis=-1)
+
+
 @lru_cache(maxsize=1)
 def _logistic_mixture() -> tuple[np.ndarray, np.ndarray]:
-    """Weights and scales with sigmoid(x) = Σⱼ weights[j] Φ(x / scales[j]), to about 1e-13 everywhere.
+    """Weights and scales with sigmoid(x) = Σⱼ weights[j] Φ(x / scales[j]), to 1e-15 everywhere.
 
     The trapezoidal rule in log κ over the Kolmogorov density, Σₙ (−1)ⁿ⁺¹ 8 n² κ exp(−2n²κ²), or its theta-function twin
     for small κ; it converges geometrically because the integrand vanishes with all derivatives at both ends.
@@ -53,78 +74,95 @@ def _logistic_mixture() -> tuple[np.ndarray, np.ndarray]:
     return weights / weights.sum(), 2 * kappa[:, 0]
 
 
-def _with_lapses(log_prob: jax.Array, lapse_rate: jax.Array | float) -> jax.Array:
-    """log(λ/2 + (1 − λ) p): with probability λ the answer is a coin toss."""
-    return jnp.logaddexp(jnp.log(jnp.asarray(lapse_rate) / 2), jnp.log1p(-jnp.asarray(lapse_rate)) + log_prob)
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Mixed:
-    """The paper's mixture of a 0-1 and a sigmoid likelihood (eq. 8): ((K − 1) 1[t > 0] + sigmoid(m t)) / K, with 1[0] = ½.
+    """The paper's mixture of a 0-1 and a sigmoid likelihood (eq. 8): ((K − 1) 1[t > 0] + sigmoid(m t)) / K, 1[0] = ½.
 
     Attributes:
       steepness: m > 0.
       number_of_preferences: K of eq. 8. It stays the full K when the likelihood predicts a held-out answer.
-      lapse_rate: λ in [0, 1).
     """
 
     steepness: float
     number_of_preferences: float
-    lapse_rate: float = 0.0
 
-    def log_prob(self, margins: jax.Array) -> jax.Array:
-        """log p(answer | t), elementwise."""
+    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """exp(min(m t, 0)) times a ratio between 1/(2K) and 1."""
         scaled = self.steepness * margins
         decay = jnp.exp(-jnp.abs(scaled))
-        above = jnp.log1p(-decay / (1 + decay) / self.number_of_preferences)
-        below = -jnp.abs(scaled) - jnp.log1p(decay) - jnp.log(self.number_of_preferences)
-        log_prob = jnp.where(margins > 0, above, jnp.where(margins < 0, below, jnp.log(0.5)))
-        # NaN margins must stay NaN: every comparison with them is false
-        return _with_lapses(log_prob + 0 * scaled, self.lapse_rate)
+        share = 1 / self.number_of_preferences
+        above = 1 + decay * (1 - share)
+        # at 0 the step is ½; a NaN margin makes `decay` NaN and stays NaN
+        return jnp.minimum(scaled, 0), jnp.where(margins > 0, above, jnp.where(margins < 0, share, 1.0)) / (1 + decay)
 
     def probit_mixture(self) -> ProbitMixture:
         """A step and a smooth part."""
         weights, scales = _logistic_mixture()
         share = 1 / self.number_of_preferences
-        return _lapsed_mixture(
-            np.append(share * weights, 1 - share), np.append(scales / self.steepness, 0.0), self.lapse_rate
-        )
+        return _mixture(np.append(share * weights, 1 - share), np.append(scales / self.steepness, 0.0))
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Logistic:
-    """Bradley–Terry: sigmoid(m t), with lapses."""
+    """Bradley–Terry: sigmoid(m t)."""
 
     steepness: float
-    lapse_rate: float = 0.0
 
-    def log_prob(self, margins: jax.Array) -> jax.Array:
-        """log p(answer | t), elementwise."""
-        return _with_lapses(jax.nn.log_sigmoid(self.steepness * margins), self.lapse_rate)
+    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """exp(min(m t, 0)) / (1 + exp(−|m t|))."""
+        scaled = self.steepness * margins
+        return jnp.minimum(scaled, 0), 1 / (1 + jnp.exp(-jnp.abs(scaled)))
 
     def probit_mixture(self) -> ProbitMixture:
         """The scale mixture of the logistic function."""
         weights, scales = _logistic_mixture()
-        return _lapsed_mixture(weights, scales / self.steepness, self.lapse_rate)
+        return _mixture(weights, scales / self.steepness)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Probit:
-    """Thurstone: Φ(m t), with lapses."""
+    """Thurstone: Φ(m t)."""
 
     steepness: float
-    lapse_rate: float = 0.0
 
-    def log_prob(self, margins: jax.Array) -> jax.Array:
-        """log p(answer | t), elementwise."""
-        return _with_lapses(jax.scipy.special.log_ndtr(self.steepness * margins), self.lapse_rate)
+    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Φ(m t) itself is the exponential of its logarithm."""
+        exponent = jax.scipy.special.log_ndtr(self.steepness * margins)
+        return exponent, jnp.ones_like(exponent)
 
     def probit_mixture(self) -> ProbitMixture:
         """One probit."""
-        return _lapsed_mixture(np.ones(1), np.array([1 / self.steepness]), self.lapse_rate)
+        return _mixture(np.ones(1), np.array([1 / self.steepness]))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class WithLapses:
+    """A constant share of coin tosses around any likelihood: λ/2 + (1 − λ) p, so 20 % wrong answers are λ = 0.4.
+
+    Attributes:
+      attentive: the likelihood p of an answer that is no coin toss.
+      lapse_rate: λ in (0, 1).
+    """
+
+    attentive: Mixed | Logistic | Probit
+    lapse_rate: float
+
+    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The larger of both terms' exponents is taken out."""
+        exponent, ratio = self.attentive.factor(margins)
+        floor = jnp.log(self.lapse_rate / 2)
+        top = jnp.maximum(exponent, floor)
+        return top, jnp.exp(floor - top) + (1 - self.lapse_rate) * jnp.exp(exponent - top) * ratio
+
+    def probit_mixture(self) -> ProbitMixture:
+        """The mixture shrunk, and a constant."""
+        constant, weights, offsets, scales = self.attentive.probit_mixture()
+        keep = 1 - self.lapse_rate
+        return ProbitMixture(self.lapse_rate / 2 + keep * constant, keep * weights, offsets, scales)
 
 
 @jax.tree_util.register_dataclass
@@ -140,17 +178,18 @@ class WithTies:
       indifferent: which answers were "no difference", shape (K,) bool, in the order of the margins' last axis.
     """
 
-    ordered: Mixed | Logistic | Probit
+    ordered: Mixed | Logistic | Probit | WithLapses
     threshold: float
     indifferent: jax.Array | np.ndarray
 
-    def log_prob(self, margins: jax.Array) -> jax.Array:
-        """log p(answer | t); the last axis of `margins` is K."""
-        preferred = self.ordered.log_prob(margins - self.threshold)
+    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The last axis of `margins` is K."""
+        preferred = log_prob(self.ordered, margins - self.threshold)
         # p(tie) is symmetric: at −|t| both terms are small and their difference keeps its relative precision
-        upper = self.ordered.log_prob(self.threshold - jnp.abs(margins))
-        lower = self.ordered.log_prob(-self.threshold - jnp.abs(margins))
-        return jnp.where(self.indifferent, upper + jnp.log(-jnp.expm1(lower - upper)), preferred)
+        upper = log_prob(self.ordered, self.threshold - jnp.abs(margins))
+        lower = log_prob(self.ordered, -self.threshold - jnp.abs(margins))
+        exponent = jnp.where(self.indifferent, upper + jnp.log(-jnp.expm1(lower - upper)), preferred)
+        return exponent, jnp.ones_like(exponent)
 
     def probit_mixture(self) -> ProbitMixture:
         """Weights (K, 2J): an ordered answer uses the half shifted by δ, a tie the difference of both."""
@@ -164,14 +203,14 @@ class WithTies:
         )
 
 
-def _lapsed_mixture(weights: np.ndarray, scales: np.ndarray, lapse_rate: float) -> ProbitMixture:
-    return ProbitMixture(lapse_rate / 2, (1 - lapse_rate) * weights, np.zeros_like(scales), scales)
+def _mixture(weights: np.ndarray, scales: np.ndarray) -> ProbitMixture:
+    return ProbitMixture(0.0, weights, np.zeros_like(scales), scales)
 
 
 def preference_likelihood(
-    name: str, *, steepness: float, number_of_preferences: int, lapse_rate: float
-) -> Mixed | Logistic | Probit:
-    """The likelihood called `name`: "mixed" (eq. 8), "logistic" or "probit".
+    name: str, *, steepness: float, number_of_preferences: int, lapse_rate: float = 0.0
+) -> Mixed | Logistic | Probit | WithLapses:
+    """The likelihood called `name`: "mixed" (eq. 8), "logistic" or "probit", with lapses where λ > 0.
 
     Raises:
       ValueError: an unknown name, steepness m ≤ 0, or a lapse rate outside [0, 1).
@@ -180,11 +219,14 @@ def preference_likelihood(
         raise ValueError(f"steepness: expected a finite number > 0, got {steepness}")
     if not 0 <= lapse_rate < 1:
         raise ValueError(f"lapse_rate: expected a number in [0, 1), got {lapse_rate}")
+    likelihood: Mixed | Logistic | Probit
     match name:
         case "mixed":
-            return Mixed(float(steepness), float(max(number_of_preferences, 1)), float(lapse_rate))
+            likelihood = Mixed(float(steepness), float(max(number_of_preferences, 1)))
         case "logistic":
-            return Logistic(float(steepness), float(lapse_rate))
+            likelihood = Logistic(float(steepness))
         case "probit":
-            return Probit(float(steepness), float(lapse_rate))
-    raise ValueError(f'likelihood: expected "mixed", "logistic", "probit" or a Likelihood, got {name!r}')
+            likelihood = Probit(float(steepness))
+        case _:
+            raise ValueError(f'likelihood: expected "mixed", "logistic" or "probit", got {name!r}')
+    return WithLapses(likelihood, float(lapse_rate)) if lapse_rate > 0 else likelihood

@@ -1,4 +1,4 @@
-"""The part of the utility that the answers can see: Ψ = L Qᵀ, w = Q z + complement (thin factorisation of the differences).
+"""The part of the utility that the answers can see: Ψ = L Qᵀ, w = Q z + complement (thin factorisation).
 
 The likelihood depends on w only through the margins t = Ψ w = L z with z = Qᵀ w ~ N(0, σ²I_r), r = rank Ψ ≤ K. What is
 orthogonal to Q keeps its prior: its draws are exact prior noise and its posterior mean is exactly zero.
@@ -27,8 +27,8 @@ class LowRank:
 def low_rank(differences: np.ndarray) -> LowRank:
     """Factorise `differences` (K, D), independently of the scale of each row.
 
-    Rows are scaled to unit length before the factorisation, so that a small row keeps its sign, and exactly zero rows are
-    set aside: rounding would otherwise turn them into hard constraints. The rank counts the singular values above
+    Rows are scaled to unit length before the factorisation, so that a small row keeps its sign, and exactly zero rows
+    are set aside: rounding would otherwise turn them into hard constraints. The rank counts the singular values above
     max(K, D) ε times the largest.
     """
     lengths = np.linalg.norm(differences, axis=1)

@@ -1,53 +1,34 @@
 """Step 1, Bayesian PBIRL: draws from p(w | preferences) that have converged, or say that they have not (eqs. 7-8)."""
 
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jax import lax
 from xarray.core import indexing
 
 from bayespbrl.diagnostics.convergence import Convergence, convergence
-from bayespbrl.models.expectation_propagation import expectation_propagation
-from bayespbrl.models.likelihoods import preference_likelihood
-from bayespbrl.models.low_rank import UtilityWeights, low_rank
+from bayespbrl.models.elliptical_slice import EllipticalSlice, EllipticalSliceState
+from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
+from bayespbrl.models.likelihoods import Likelihood, WithTies, log_prob, preference_likelihood, total_log_prob
+from bayespbrl.models.low_rank import LowRank, UtilityWeights, low_rank
+from bayespbrl.models.preference_model import (
+    PreferenceProblem,
+    low_rank_model,
+    padded_problem,
+    prior_ellipse,
+    reference_ellipse,
+)
 
-
-@partial(jax.jit, static_argnames=("draws", "moves"))
-def _chain(key, z, loadings, mask, likelihood, prior_scale, mean, root, inverse_root, *, draws, moves):
-    def residual(z, y):
-        log_lik = jnp.sum(jnp.where(mask, likelihood.log_prob(loadings @ z), 0.0))
-        return log_lik - 0.5 * jnp.sum(z**2) / prior_scale**2 + 0.5 * jnp.sum(y**2)
-
-    def move(z, key, plain):
-        m = jnp.where(plain, 0.0, mean)
-        a = jnp.where(plain, prior_scale * jnp.eye(len(mean)), root)
-        b = jnp.where(plain, jnp.eye(len(mean)) / prior_scale, inverse_root)
-        k1, k2, k3, k4 = jax.random.split(key, 4)
-        y, xi = b @ (z - m), jax.random.normal(k1, z.shape)
-        level = residual(z, y) + jnp.log(jax.random.uniform(k2))
-        angle = jax.random.uniform(k3, maxval=2 * jnp.pi)
-        at = lambda angle: y * jnp.cos(angle) + xi * jnp.sin(angle)  # noqa: E731
-        value = lambda angle: residual(m + a @ at(angle), at(angle))  # noqa: E731
-
-        def shrink(c):
-            angle, low, high, key, n = c
-            low, high = jnp.where(angle < 0, angle, low), jnp.where(angle < 0, high, angle)
-            key, sub = jax.random.split(key)
-            return jax.random.uniform(sub, minval=low, maxval=high), low, high, key, n + 1
-
-        c = jax.lax.while_loop(
-            lambda c: ~(value(c[0]) > level) & (c[4] < 200), shrink, (angle, angle - 2 * jnp.pi, angle, k4, 0)
-        )
-        return jnp.where(c[4] < 200, m + a @ at(c[0]), z)
-
-    def draw(z, key):
-        for i, sub in enumerate(jax.random.split(key, moves)):
-            z = move(z, sub, i % 2 == 1)
-        return z, z
-
-    return jax.lax.scan(draw, z, jax.random.split(key, draws))
+# Share of each answer's Gaussian factor that enters the reference: with all of it the reference is as narrow as the
+# posterior's bulk and its residual has no bound in the tails; towards none it is the prior, which mixes badly.
+REFERENCE_POWER = 0.6
+# Moves round the reference's and the prior's ellipses per recorded draw.
+REFERENCE_MOVES, PRIOR_MOVES = 15, 1
 
 
 def sample_posterior(
@@ -57,117 +38,312 @@ def sample_posterior(
     steepness: float = 5.0,
     lapse_rate: float = 0.0,
     likelihood: str = "mixed",
-    num_warmup: int = 200,
+    indifferent: np.ndarray | None = None,
+    tie_threshold: float | None = None,
+    number_of_preferences: int | None = None,
+    num_warmup: int = 250,
     num_samples: int = 1000,
+    max_samples: int = 16_000,
     num_chains: int = 4,
     seed: int = 0,
 ) -> xr.DataTree:
-    """Draw from the posterior of the utility weights w ~ N(0, σ²I) given preferences (eqs. 7-8)."""
-    differences = np.asarray(differences, dtype=float)
-    if differences.ndim != 2 or not np.all(np.isfinite(differences)):
-        raise ValueError(f"differences: expected a finite matrix (K, D), got shape {differences.shape} or NaN/infinity")
+    """Draw from the posterior of the utility weights w ~ N(0, σ²I) given preferences (eqs. 7-8), until it converges.
+
+    After `num_samples` draws a chain, and after every doubling, R̂ ≤ 1.01 and at least 400 effective draws are asked of
+    every margin; what has not met them at `max_samples` says `converged = 0`. Everything is computed in float64.
+
+    Args:
+      differences: ψ(preferred) − ψ(dominated), shape (K, D), used as given: divide by a scale of your choice first.
+        A row of zeros has a margin of exactly zero in every draw. K = 0 gives the prior.
+      prior_scale: σ > 0.
+      steepness: m > 0.
+      lapse_rate: λ in [0, 1), the share of answers that are coin tosses.
+      likelihood: "mixed" (eq. 8), "logistic" or "probit".
+      indifferent: which answers were "no difference", shape (K,) bool; needs `tie_threshold`. The sign of such a row
+        does not matter.
+      tie_threshold: δ > 0: margins within it are often called ties. None: no ties, and no threshold.
+      number_of_preferences: K of eq. 8, where it is not the number of rows (an answer held out).
+      num_warmup: draws a chain that are thrown away; rounded up to whole chunks of min(num_samples, 250) draws.
+      num_samples: draws a chain to begin with, >= 4.
+      max_samples: cap on the draws a chain.
+      num_chains: >= 2, so that R̂ means something.
+      seed: of everything random; the same seed gives the same draws.
+
+    Returns:
+      A tree with the groups
+      `posterior`: margins (chain, draw, preference), coordinates z (chain, draw, coordinate), and utility_weights
+        (chain, draw, feature), which is computed where it is indexed and held nowhere;
+      `sample_stats`: lp (log likelihood), candidates (per move), stuck;
+      `log_likelihood`: answers (chain, draw, preference); `observed_data`: answers, 1 as given and 0 for a tie;
+      `constant_data`: differences;
+      at the root: utility_weights_mean (feature), whose part outside the differences' row space is exactly zero;
+        utility_weights_most_likely (feature), the draw of highest likelihood with the rest at its mean, zero; and the
+        attributes log_evidence (expectation propagation's), log_evidence_converged, rhat_max,
+        effective_sample_size_min, converged, stuck, prior_scale, steepness, lapse_rate, likelihood, seed.
+      `stored(tree).to_netcdf(path)` writes it without the utility weights; `restored` brings them back.
+
+    Raises:
+      ValueError: an argument out of its range, named with what came.
+    """
+    differences = _checked(differences, prior_scale=prior_scale)
+    for name, value, least in (
+        ("num_warmup", num_warmup, 0),
+        ("num_samples", num_samples, 4),
+        ("max_samples", max_samples, num_samples),
+        ("num_chains", num_chains, 2),
+        ("seed", seed, 0),
+    ):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")
+    fit = fit_gaussian(
+        differences,
+        prior_scale=prior_scale,
+        likelihood=_with_ties(
+            preference_likelihood(
+                likelihood,
+                steepness=steepness,
+                number_of_preferences=len(differences) if number_of_preferences is None else number_of_preferences,
+                lapse_rate=lapse_rate,
+            ),
+            len(differences),
+            indifferent,
+            tie_threshold,
+        ),
+    )
+    settings = {
+        "prior_scale": float(prior_scale),
+        "steepness": float(steepness),
+        "lapse_rate": float(lapse_rate),
+        "likelihood": likelihood,
+        "tie_threshold": float("nan") if tie_threshold is None else float(tie_threshold),
+        "seed": int(seed),
+    }
+    with jax.enable_x64(True):
+        chains = _Chains.start(fit, num_chains=num_chains, chunk=min(num_samples, 250), seed=seed)
+        chains = replace(chains.extended(num_warmup), draws=())
+        wanted = num_samples
+        while True:
+            chains = chains.extended(wanted - chains.length)
+            report = convergence(chains.collected("coordinates", wanted) @ fit.factors.loadings.T)
+            if report.converged() or 2 * wanted > max_samples:
+                break
+            wanted *= 2
+    return _tree(differences, fit, chains, wanted, report, settings)
+
+
+@dataclass(frozen=True)
+class GaussianFit:
+    """A posterior's thin factorisation and its Gaussian approximation.
+
+    Attributes:
+      factors: Ψ = L Qᵀ.
+      likelihood: p.
+      prior_scale: σ.
+      approximation: expectation propagation's, of z.
+      log_evidence: its log marginal likelihood of all answers, rows of zero included.
+    """
+
+    factors: LowRank
+    likelihood: Likelihood
+    prior_scale: float
+    approximation: GaussianApproximation
+    log_evidence: float
+
+
+def fit_gaussian(differences: np.ndarray, *, prior_scale: float, likelihood: Likelihood) -> GaussianFit:
+    """Factorise the differences (K, D) and fit a Gaussian by expectation propagation: how `sample_posterior` begins."""
+    factors = low_rank(differences)
+    used = np.any(factors.loadings != 0, axis=1)
+    mixture = likelihood.probit_mixture()
+    if np.ndim(mixture.weights) == 2:
+        mixture = mixture._replace(constant=np.asarray(mixture.constant)[used], weights=mixture.weights[used])
+    approximation = expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale)
+    with jax.enable_x64(True):
+        at_zero = np.asarray(_log_prob(likelihood, np.zeros(len(used)))) if len(used) else np.zeros(0)
+    return GaussianFit(
+        factors, likelihood, prior_scale, approximation, approximation.log_evidence + float(np.sum(at_zero[~used]))
+    )
+
+
+@dataclass(frozen=True)
+class _Chains:
+    """Chains that can be extended, a chunk of fixed length at a time, by one compiled sampler."""
+
+    problem: PreferenceProblem
+    state: EllipticalSliceState
+    chunk: int
+    rank: int
+    number: int
+    draws: tuple[dict[str, np.ndarray], ...] = ()
+
+    @classmethod
+    def start(cls, fit: GaussianFit, *, num_chains: int, chunk: int, seed: int) -> "_Chains":
+        loadings, approximation = fit.factors.loadings, fit.approximation
+        used = np.any(loadings != 0, axis=1)
+        rank = loadings.shape[1]
+        weighted = loadings[used].T * (REFERENCE_POWER * approximation.site_precisions)
+        precision = np.eye(rank) + fit.prior_scale**2 * weighted @ loadings[used]
+        covariance = fit.prior_scale**2 * np.linalg.inv(precision)
+        problem = padded_problem(
+            loadings,
+            fit.likelihood,
+            prior_scale=fit.prior_scale,
+            mean=approximation.mean,
+            covariance=(covariance + covariance.T) / 2,
+        )
+        # from the reference, which is wider than the posterior's bulk: chains that agree have forgotten where they began
+        noise = np.random.default_rng(seed).standard_normal((num_chains, len(problem.centre)))
+        start = problem.centre + noise @ problem.root.T
+        start, zeros = jnp.asarray(start), jnp.zeros(num_chains)
+        keys = jax.random.split(jax.random.key(seed), num_chains)
+        state = EllipticalSliceState({"utility_weights": start}, zeros, zeros, zeros.astype(bool), keys)
+        return cls(problem, state, chunk, rank, len(loadings))
+
+    @property
+    def length(self) -> int:
+        return sum(len(part["lp"][0]) for part in self.draws)
+
+    def extended(self, more: int) -> "_Chains":
+        """At least `more` draws longer."""
+        draws, state = list(self.draws), self.state
+        for _ in range(-(-more // self.chunk)):
+            state, states, answers = _run(state, self.problem, length=self.chunk)
+            draws.append(
+                {
+                    "coordinates": np.asarray(states.z["utility_weights"])[:, :, : self.rank],
+                    "answers": np.asarray(answers)[:, :, : self.number],
+                    "lp": np.asarray(states.log_likelihood),
+                    "candidates": np.asarray(states.candidates),
+                    "stuck": np.asarray(states.stuck),
+                }
+            )
+        return replace(self, state=state, draws=tuple(draws))
+
+    def collected(self, name: str, length: int) -> np.ndarray:
+        return np.concatenate([part[name] for part in self.draws], axis=1)[:, :length]
+
+
+_log_prob = jax.jit(log_prob)
+
+
+def _ellipses(model_args: tuple, model_kwargs: dict) -> list:
+    (problem,) = model_args
+    return [(reference_ellipse(problem), REFERENCE_MOVES), (prior_ellipse(problem), PRIOR_MOVES)]
+
+
+def _log_likelihood(z: dict, model_args: tuple, model_kwargs: dict) -> jax.Array:
+    (problem,) = model_args
+    return total_log_prob(problem.likelihood, problem.loadings @ z["utility_weights"], problem.used)
+
+
+# The same kernel as for numpyro.infer.MCMC, which compiles anew on every run; this loop does once for each capacity.
+KERNEL = EllipticalSlice(low_rank_model, batch=8, ellipses=_ellipses, log_likelihood=_log_likelihood)
+
+
+# Half the compiler's effort is lost on a loop of small vectors: level 1 compiles faster and runs as fast.
+@partial(jax.jit, static_argnames="length", compiler_options={"xla_backend_optimization_level": 1})
+def _run(
+    state: EllipticalSliceState, problem: PreferenceProblem, *, length: int
+) -> tuple[EllipticalSliceState, EllipticalSliceState, jax.Array]:
+    """`length` draws of all chains: the last state, all states (chain, draw, ...), and log p of each answer at each."""
+
+    def draw(state, _):
+        state = KERNEL.sample(state, (problem,), {})
+        return state, state._replace(rng_key=jnp.zeros(()))
+
+    last, states = lax.scan(draw, state, None, length=length)
+    states = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1) if x.ndim > 1 else x, states)
+    answers = log_prob(problem.likelihood, states.z["utility_weights"] @ problem.loadings.T)
+    return last, states, answers
+
+
+def _checked(differences: np.ndarray, *, prior_scale: float) -> np.ndarray:
+    differences = np.asarray(differences, dtype=np.float64)
+    if differences.ndim != 2 or differences.shape[1] == 0:
+        raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
+    if not np.all(np.isfinite(differences)):
+        raise ValueError(f"differences: expected finite entries, got {np.sum(~np.isfinite(differences))} that are not")
     if not (np.isfinite(prior_scale) and prior_scale > 0):
         raise ValueError(f"prior_scale: expected a finite number > 0, got {prior_scale}")
-    number = len(differences)
-    model = preference_likelihood(likelihood, steepness=steepness, number_of_preferences=number, lapse_rate=lapse_rate)
-    factors = low_rank(differences)
-    rank = factors.loadings.shape[1]
-    used = np.any(factors.loadings != 0, axis=1)
-    gaussian = expectation_propagation(factors.loadings[used], model.probit_mixture(), prior_scale=prior_scale)
-    capacity = max(8, 1 << (max(number, 1) - 1).bit_length())
-    pad = capacity - rank
-    with jax.enable_x64(True):
-        loadings = np.zeros((capacity, capacity))
-        loadings[:number, :rank] = factors.loadings
-        mask = np.zeros(capacity, bool)
-        mask[:number] = used
-        root = np.eye(capacity) * prior_scale
-        root[:rank, :rank] = np.linalg.cholesky(1.3 * gaussian.covariance)
-        mean = np.pad(gaussian.mean, (0, pad))
-        key = jax.random.key(seed)
-        run = jax.vmap(
-            partial(_chain, draws=num_samples, moves=8),
-            in_axes=(0, 0, None, None, None, None, None, None, None),
-        )
-        start = mean + np.random.default_rng(seed).standard_normal((num_chains, capacity)) @ root.T
-        arguments = (loadings, mask, model, prior_scale, mean, root, np.linalg.inv(root))
-        state, _ = run(jax.random.split(jax.random.fold_in(key, 0), num_chains), start, *arguments)
-        draws = np.zeros((num_chains, 0, rank))
-        for attempt in range(5):
-            for chunk in range(1 if attempt == 0 else 2 ** (attempt - 1)):
-                sub = jax.random.fold_in(jax.random.fold_in(key, 1 + attempt), chunk)
-                state, more = run(jax.random.split(sub, num_chains), state, *arguments)
-                draws = np.concatenate([draws, np.asarray(more)[:, :, :rank]], axis=1)
-            margins = draws @ factors.loadings.T
-            report = convergence(margins)
-            if report.converged():
-                break
-        log_likelihood = np.asarray(model.log_prob(margins)) if number else np.zeros(margins.shape)
-    return _tree(
-        differences, factors, draws, margins, log_likelihood, report, gaussian.log_evidence + np.log(0.5) * np.sum(~used),
-        {"prior_scale": prior_scale, "steepness": steepness, "lapse_rate": lapse_rate, "seed": seed,
-         "likelihood": likelihood},
-    )  # fmt: skip
+    return differences
 
 
-def _tree(differences, factors, draws, margins, log_likelihood, report: Convergence, log_evidence, settings):
-    number = len(differences)
-    sample = ("chain", "draw")
-    coordinates = {"chain": np.arange(draws.shape[0]), "draw": np.arange(draws.shape[1])}
-    lazy = UtilityWeights(draws, factors.basis, prior_scale=settings["prior_scale"], seed=settings["seed"])
-    posterior = xr.Dataset(
-        {
-            "margins": ((*sample, "preference"), margins),
-            "coordinates": ((*sample, "coordinate"), draws),
-            "utility_weights": xr.Variable((*sample, "feature"), indexing.LazilyIndexedArray(lazy)),
-        },
-        coordinates,
-    )
-    total = log_likelihood.sum(axis=2)
-    best = np.unravel_index(np.argmax(total), total.shape)
+def _with_ties(likelihood: Any, number: int, indifferent: np.ndarray | None, threshold: float | None) -> Likelihood:
+    if threshold is None:
+        if indifferent is not None and np.any(indifferent):
+            raise ValueError("tie_threshold: expected a number > 0 because some answers are indifferent, got None")
+        return likelihood
+    if not (np.isfinite(threshold) and threshold > 0):
+        raise ValueError(f"tie_threshold: expected a finite number > 0, got {threshold}")
+    tied = np.zeros(number, dtype=bool) if indifferent is None else np.asarray(indifferent)
+    if tied.shape != (number,) or tied.dtype != bool:
+        raise ValueError(f"indifferent: expected bool of shape ({number},), got {tied.dtype} of shape {tied.shape}")
+    return WithTies(likelihood, float(threshold), tied)
+
+
+def _tree(
+    differences: np.ndarray, fit: GaussianFit, chains: _Chains, length: int, report: Convergence, settings: dict
+) -> xr.DataTree:
+    sample, answer = ("chain", "draw"), ("chain", "draw", "preference")
+    z = chains.collected("coordinates", length)
+    answers, stuck = chains.collected("answers", length), chains.collected("stuck", length)
+    lp, candidates = np.sum(answers, axis=2), chains.collected("candidates", length)
+    labels = {"chain": np.arange(z.shape[0]), "draw": np.arange(length)}
+    tied = getattr(fit.likelihood, "indifferent", np.zeros(len(differences), dtype=bool))
     root = xr.Dataset(
         {
-            "utility_weights_mean": ("feature", factors.basis @ draws.mean(axis=(0, 1))),
-            "utility_weights_most_likely": ("feature", factors.basis @ draws[best]),
+            "utility_weights_mean": ("feature", fit.factors.basis @ z.mean(axis=(0, 1))),
+            "utility_weights_most_likely": (
+                "feature",
+                fit.factors.basis @ z[np.unravel_index(np.argmax(lp), lp.shape)],
+            ),
         },
         attrs={
-            "log_evidence": float(log_evidence),
+            "log_evidence": fit.log_evidence,
+            "log_evidence_converged": int(fit.approximation.converged),
             "rhat_max": report.rhat_max,
-            "effective_sample_size_min": min(report.effective_sample_size_min, float(total.size)),
+            "effective_sample_size_min": min(report.effective_sample_size_min, float(lp.size)),
             "converged": int(report.converged()),
+            "stuck": int(np.sum(stuck)),
             **settings,
         },
     )
+    posterior = xr.Dataset(
+        {"margins": (answer, z @ fit.factors.loadings.T), "coordinates": ((*sample, "coordinate"), z)}, labels
+    )
+    statistics = {"lp": (sample, lp), "candidates": (sample, candidates), "stuck": (sample, stuck)}
     return xr.DataTree.from_dict(
         {
             "/": root,
-            "/posterior": posterior,
-            "/sample_stats": xr.Dataset({"log_likelihood_sum": (sample, total)}, coordinates),
-            "/log_likelihood": xr.Dataset({"answers": ((*sample, "preference"), log_likelihood)}, coordinates),
-            "/observed_data": xr.Dataset({"answers": ("preference", np.ones(number, dtype=np.int8))}),
+            "/posterior": _with_weights(posterior, fit.factors.basis, settings),
+            "/sample_stats": xr.Dataset(statistics, labels),
+            "/log_likelihood": xr.Dataset({"answers": (answer, answers)}, labels),
+            "/observed_data": xr.Dataset({"answers": ("preference", (~tied).astype(np.int8))}),
             "/constant_data": xr.Dataset({"differences": (("preference", "feature"), differences)}),
         }
     )
 
 
+def _with_weights(posterior: xr.Dataset, basis: np.ndarray, settings: Any) -> xr.Dataset:
+    z = posterior["coordinates"].values
+    lazy = UtilityWeights(z, basis, prior_scale=float(settings["prior_scale"]), seed=int(settings["seed"]))
+    weights = xr.Variable(("chain", "draw", "feature"), indexing.LazilyIndexedArray(lazy))
+    return posterior.assign(utility_weights=weights)
+
+
 def stored(tree: xr.DataTree) -> xr.DataTree:
-    """The tree without the lazy `posterior["utility_weights"]`, for `to_netcdf`; `restored` brings it back."""
-    small = tree.copy()
-    small["posterior"] = xr.DataTree(tree["posterior"].to_dataset().drop_vars("utility_weights", errors="ignore"))
-    return small
+    """The tree without the computed `posterior["utility_weights"]`, to write to disk; `restored` brings it back."""
+    posterior = tree.children["posterior"].to_dataset(inherit=False).drop_vars("utility_weights", errors="ignore")
+    return _replaced(tree, posterior)
 
 
 def restored(tree: xr.DataTree) -> xr.DataTree:
-    """A tree read back from disk, with its lazy `posterior["utility_weights"]` again."""
-    whole = tree.copy()
-    factors = low_rank(tree["constant_data"]["differences"].values)
-    posterior = tree["posterior"].to_dataset()
-    lazy = UtilityWeights(
-        posterior["coordinates"].values,
-        factors.basis,
-        prior_scale=float(tree.attrs["prior_scale"]),
-        seed=int(tree.attrs["seed"]),
-    )
-    posterior["utility_weights"] = xr.Variable(("chain", "draw", "feature"), indexing.LazilyIndexedArray(lazy))
-    whole["posterior"] = xr.DataTree(posterior)
-    return whole
+    """A tree read back from disk, with `posterior["utility_weights"]` computed where it is indexed, as before."""
+    basis = low_rank(tree.children["constant_data"].to_dataset()["differences"].values).basis
+    posterior = tree.children["posterior"].to_dataset(inherit=False)
+    return _replaced(tree, _with_weights(posterior, basis, tree.attrs))
+
+
+def _replaced(tree: xr.DataTree, posterior: xr.Dataset) -> xr.DataTree:
+    groups = {path: node.to_dataset(inherit=False) for path, node in tree.subtree_with_keys}
+    return xr.DataTree.from_dict({**groups, "posterior": posterior})
