@@ -118,7 +118,7 @@ class Learner:
           ValueError: an answer that is none, or not as many answers as questions; nothing has happened then.
         """
         waiting = self._waiting()
-        if isinstance(answers, str) or len(answers) != len(waiting):
+        if isinstance(answers, str) or not isinstance(answers, Sequence) or len(answers) != len(waiting):
             raise ValueError(f"tell: expected a list of {len(waiting)} answers, one a question, got {answers!r}")
         for query, answer in zip(waiting, map(parse_answer, answers), strict=True):
             if answer is Answer.UNDO:

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bayespbrl.preferences import Answer, Preferences, Query
+from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
 from bayespbrl.trajectories import Trajectory
 
 
@@ -165,7 +165,7 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         raise ValueError(f"answered: expected an answer to {query}, got one to question {event['query']}")
     left = tuple(number for number in state.candidates if number != query.newcomer)
     after = replace(state, query=None, candidates=left, previous=state)
-    answer = Answer(event["answer"])
+    answer = parse_answer(event["answer"])
     if answer is Answer.SKIP:
         return after
     preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]

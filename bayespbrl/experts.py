@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from bayespbrl.preferences import Answer
+from bayespbrl.preferences import Answer, parse_answer
 from bayespbrl.trajectories import Trajectory
 
 TIE_TOLERANCE = 1e-9  # relative: sums in another order must not decide
@@ -54,9 +54,11 @@ class NoisyExpert:
     def __post_init__(self) -> None:
         if not 0 <= self.wrong_answers <= 1:
             raise ValueError(f"wrong_answers: expected a share in [0, 1], got {self.wrong_answers}")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f"seed: expected a whole number >= 0, got {self.seed!r}")
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
-        answer = Answer(self.expert(first, second))
+        answer = parse_answer(self.expert(first, second))
         marks = sorted(zlib.crc32(t.actions.tobytes(), zlib.crc32(t.states.tobytes())) for t in (first, second))
         wrong = np.random.default_rng([self.seed, *marks]).random() < self.wrong_answers
         reversal = {Answer.FIRST: Answer.SECOND, Answer.SECOND: Answer.FIRST}

@@ -68,6 +68,17 @@ def test_a_share_of_wrong_answers_outside_zero_to_one_is_refused(share):
         NoisyExpert(ReturnExpert(), share)
 
 
+@pytest.mark.parametrize("seed", [-1, 0.5, True, None])
+def test_a_seed_that_is_no_whole_number_is_refused(seed):
+    with pytest.raises(ValueError, match="seed: expected a whole number"):
+        NoisyExpert(ReturnExpert(), 0.1, seed=seed)
+
+
+def test_nonsense_of_the_expert_within_is_named():
+    with pytest.raises(ValueError, match=r"expert: expected one of .*, got 'left'"):
+        NoisyExpert(lambda a, b: "left", 0.1)(trajectory([1.0]), trajectory([0.0], 1))
+
+
 def person(tmp_path, *replies):
     lines = iter(replies)
 

@@ -1,0 +1,428 @@
+"""The learner: its protocol, ask and tell, undo and skip, and continuing from any point."""
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+
+from bayespbrl import Answer, Learner, ReturnExpert, rollouts
+from bayespbrl.envs.gridworld import REWARDS
+from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
+
+QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
+
+
+class Memory:
+    """A log in memory."""
+
+    def __init__(self):
+        self.entries = []
+
+    def append(self, entry, state):
+        self.entries.append(entry)
+
+
+def learner(entries=(), **changes):
+    return Learner("gridworld", entries=entries, **(QUICK | changes))
+
+
+def remembered(**changes):
+    log = Memory()
+    return learner(**changes).logged(log), log
+
+
+def fingerprint(learner):
+    """Everything that must come out the same, bit for bit."""
+    posterior = getattr(learner.estimate, "posterior", None)
+    return {
+        "summaries": [{k: v for k, v in s.items() if k != "seconds"} for s in learner.iterations],
+        "policy": [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
+        "trajectories": [
+            (t.states.tobytes(), t.actions.tobytes(), t.rewards.tobytes(), t.terminated) for t in learner.trajectories
+        ],
+        "preferences": learner.preferences,
+        "weights": None if learner.estimate is None else np.asarray(learner.estimate.weights).tobytes(),
+        "draws": None if posterior is None else posterior["posterior"]["coordinates"].values.tobytes(),
+        "question": None if learner.state.query is None else (learner.state.query.first, learner.state.query.second),
+    }
+
+
+class Counting:
+    """The simulated expert, and which questions it was asked."""
+
+    def __init__(self):
+        self.asked = []
+
+    def __call__(self, first, second):
+        self.asked.append((first.states.tobytes(), second.states.tobytes()))
+        return ReturnExpert()(first, second)
+
+
+def test_twenty_five_iterations_take_twenty_six_answers():
+    expert = Counting()
+    run = learner(iterations=25, evaluation_episodes=1, max_steps=10).run(expert)
+    assert [summary["answers"] for summary in run.iterations] == list(range(2, 27))
+    assert [summary["iteration"] for summary in run.iterations] == list(range(1, 26))
+    assert len(expert.asked) == run.preferences.answers == 26
+    assert len(run.trajectories) == 250
+    assert run.finished
+    assert run.ask() == []
+
+
+def test_the_first_iteration_compares_three_of_the_new_trajectories_and_later_ones_the_best():
+    run = learner()
+    shown = []
+    while questions := run.ask():
+        assert len(questions) == 1
+        shown.append(questions[0])
+        if run.state.iteration:
+            new = run.trajectories[-10:]
+            best = np.argmax(run.estimate.trajectory_utilities(new))
+            assert questions[0].newcomer == len(run.trajectories) - 10 + best
+        assert questions[0].incumbent == run.preferences.undominated[-1]
+        run.tell([ReturnExpert()(*questions[0].trajectories)])
+    assert [query.number for query in shown] == [1, 2, 3, 4]
+    first_three = {shown[0].first, shown[0].second, shown[1].newcomer}
+    assert len(first_three) == 3
+    assert max(first_three) < 10
+    assert [query.newcomer // 10 for query in shown] == [0, 0, 1, 2]
+
+
+def test_more_questions_an_iteration_are_asked_one_after_the_other():
+    run = learner(first_queries=4, queries_per_iteration=3).run(ReturnExpert())
+    assert [summary["answers"] for summary in run.iterations] == [4, 7, 10]
+
+
+def test_asking_again_changes_nothing():
+    run, log = remembered()
+    question = run.ask()
+    length, state = len(log.entries), run.state
+    assert run.ask() == question
+    assert run.state is state
+    assert len(log.entries) == length
+
+
+@pytest.mark.parametrize(
+    "answers", [[], ["first", "second"], "first", Answer.FIRST, ["both"], [None], [3], None, 5, iter(["first"])]
+)
+def test_what_is_no_answer_is_refused_and_nothing_has_happened(answers):
+    run, log = remembered()
+    run.ask()
+    state, length = run.state, len(log.entries)
+    with pytest.raises(ValueError, match=r"tell: expected a list of 1|expert: expected one of"):
+        run.tell(answers)
+    assert run.state is state
+    assert len(log.entries) == length
+    with pytest.raises(ValueError, match="tell: expected a list of 0 answers"):
+        learner().tell(["first"])  # nothing has been asked yet
+
+
+def test_an_expert_that_answers_nonsense_is_named_and_can_be_replaced():
+    run = learner()
+    with pytest.raises(ValueError, match=r"expert: expected one of 'first', .*, got 'perhaps'"):
+        run.run(lambda first, second: "perhaps")
+    assert fingerprint(run.run(ReturnExpert())) == fingerprint(learner().run(ReturnExpert()))
+
+
+def test_the_expert_sees_the_two_in_the_order_shown_and_progress_follows_each_answer():
+    seen, progress = [], []
+    run = learner()
+
+    def expert(first, second):
+        (query,) = run.ask()
+        assert (first, second) == query.trajectories
+        seen.append(query.number)
+        return "tie"
+
+    run.run(expert, progress=lambda run: progress.append(run.preferences.answers))
+    assert seen == progress == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("answers_before", [1, 2, 3, 4])
+@pytest.mark.parametrize("undone", [1, 2, 3])
+def test_undoing_and_answering_the_same_gives_the_run_that_was_never_undone(answers_before, undone):
+    straight = learner().run(ReturnExpert())
+    run = learner()
+    for _ in range(answers_before):
+        run.tell([ReturnExpert()(*run.ask()[0].trajectories)])
+    for _ in range(min(undone, answers_before)):
+        run.undo()
+    assert run.preferences.answers == max(0, answers_before - undone)
+    assert fingerprint(run.run(ReturnExpert())) == fingerprint(straight)
+
+
+def test_undo_as_an_answer_takes_the_previous_one_back_and_asks_it_again():
+    run = learner()
+    first = run.ask()
+    run.tell(["first"])
+    assert run.ask() != first
+    run.tell(["undo"])
+    assert run.ask() == first
+    assert run.preferences.answers == 0
+
+
+def test_nothing_can_be_undone_before_the_first_answer():
+    run = learner()
+    run.ask()
+    with pytest.raises(ValueError, match="undo: expected an answer to take back, got none yet"):
+        run.undo()
+    with pytest.raises(ValueError, match="undo"):
+        run.tell(["undo"])
+    replies = iter(["undo", "undo", "tie", "tie", "tie", "tie"])
+    assert run.run(lambda first, second: next(replies)).preferences.answers == 4
+
+
+def test_another_answer_after_undoing_leads_elsewhere():
+    run = learner()
+    run.ask()
+    run.tell(["first"])
+    before = run.preferences
+    run.undo()
+    run.tell(["second"])
+    assert run.preferences.answers == 1
+    assert run.preferences != before
+
+
+def test_a_skipped_question_is_followed_by_one_about_the_next_candidate():
+    run = learner()
+    (question,) = run.ask()
+    following = run.state.candidates[1]
+    run.tell(["skip"])
+    (after,) = run.ask()
+    assert (question.number, after.number) == (1, 2)
+    assert (after.newcomer, after.incumbent) == (following, question.incumbent)
+    assert run.preferences.answers == 0
+
+
+def test_a_run_in_which_all_is_skipped_moves_on_and_learns_nothing():
+    asked = []
+    run = learner(iterations=2).run(lambda first, second: asked.append(1) or "skip")
+    assert run.finished
+    assert len(asked) == 9 + 10  # in the first iteration one of the ten is what the others are compared with
+    assert [summary["answers"] for summary in run.iterations] == [0, 0]
+    np.testing.assert_allclose(run.policy.table, 0.2, atol=1e-6)
+
+
+def test_a_run_of_ties_counts_its_answers_and_learns_nothing():
+    run = learner().run(lambda first, second: "tie")
+    assert [(s["answers"], s["pairs"], s["bound_active"]) for s in run.iterations] == [(2, 0, False), *run_of_ties()]
+    assert len(run.preferences.undominated) == 5
+    np.testing.assert_allclose(run.policy.table, 0.2, atol=1e-6)
+
+
+def run_of_ties():
+    return [(3, 0, False), (4, 0, False)]
+
+
+def test_a_learner_continued_from_any_point_of_its_log_is_the_one_that_was_never_stopped():
+    straight, log = remembered()
+    expert = Counting()
+    straight.run(expert)
+    for length in range(len(log.entries)):
+        rest = Counting()
+        continued = learner(log.entries[:length])
+        assert fingerprint(continued.run(rest)) == fingerprint(straight)
+        answered = sum(entry.event["event"] == "answered" for entry in log.entries[:length])
+        assert rest.asked == expert.asked[answered:]  # never asked again what was answered
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another():
+    one, same, other = (fingerprint(learner(seed=seed).run(ReturnExpert())) for seed in (1, 1, 2))
+    assert one == same
+    assert one["trajectories"] != other["trajectories"]
+
+
+def test_what_cannot_be_logged_has_not_happened():
+    class Full(Memory):
+        def append(self, entry, state):
+            if len(self.entries) == 3:
+                raise OSError("no space left on device")
+            super().append(entry, state)
+
+    log = Full()
+    run = learner().logged(log)
+    run.ask()
+    with pytest.raises(OSError, match="no space"):
+        run.tell(["first"])  # the answer is kept, the next question is not
+    assert [entry.event["event"] for entry in log.entries] == ["collected", "asked", "answered"]
+    assert (run.preferences.answers, run.state.query) == (1, None)
+    log.__class__ = Memory  # there is space again
+    assert fingerprint(run.run(lambda a, b: "first")) == fingerprint(learner().run(lambda a, b: "first"))
+
+
+def test_the_value_is_the_mean_return_of_the_new_policy_on_fixed_episodes():
+    run = learner().run(ReturnExpert())
+    key = jax.random.key(int(np.random.default_rng([7, 6, 0]).integers(2**31)))
+    returns = rollouts.returns("gridworld", run.policy, key=key, episodes=3, max_steps=20)
+    assert run.iterations[-1]["value"] == returns.total.mean()
+
+
+def test_a_summary_says_how_the_iteration_went():
+    for summary in learner().run(ReturnExpert()).iterations:
+        assert summary["kl"] == pytest.approx(0.3, rel=0.01)
+        assert summary["kl_fitted_policy"] == pytest.approx(0.3, rel=0.01)
+        assert summary["bound_active"]
+        assert summary["feature_gap"] < 1e-6
+        assert 0 < summary["rank_kept"] <= 25
+        assert summary["pairs_satisfied"] <= summary["pairs"]
+        assert summary["rhat_max"] is None  # a linear program draws nothing
+        assert set(summary["seconds"]) == {"utility", "improvement", "evaluation"}
+        assert all(seconds > 0 for seconds in summary["seconds"].values())
+
+
+def test_the_learner_follows_the_expert_and_not_the_hidden_reward():
+    # This expert wants the bottom left corner, where the environment's reward is smallest.
+    wish = REWARDS[::-1, ::-1].ravel()
+
+    def expert(first, second):
+        return "first" if wish[first.states[1:]].sum() > wish[second.states[1:]].sum() else "second"
+
+    run = learner(iterations=12, max_steps=60, kl_bound=0.6).run(expert)
+    wishes = [wish[trajectory.states[1:]].sum() for trajectory in run.trajectories]
+    assert np.mean(wishes[-10:]) > 2 * np.mean(wishes[:10])
+    assert run.iterations[-1]["value"] < run.iterations[0]["value"]
+
+
+def test_features_of_the_users_own_are_used():
+    def corner(states):
+        return np.column_stack([states == 4, states == 20]).astype(float)
+
+    run = learner(features=corner, iterations=2).run(ReturnExpert())
+    assert run.settings.features == "other"
+    assert run.estimate.weights.shape == (2,)
+
+
+def test_features_of_the_users_own_that_are_not_finite_are_refused_and_the_answers_kept():
+    run, log = remembered(features=lambda states: np.full((len(states), 2), np.nan))
+    with pytest.raises(ValueError, match="features <lambda>: expected finite numbers"):
+        run.run(ReturnExpert())
+    assert run.preferences.answers == 2
+    continued = learner(log.entries, features=lambda states: np.eye(25)[states])
+    assert continued.run(ReturnExpert()).preferences.answers == 4
+
+
+def test_a_first_policy_of_the_users_own_is_where_learning_starts():
+    right = np.full((25, 5), 0.01)
+    right[:, 3] = 0.96
+    run = learner(policy=TabularPolicy(right))
+    run.ask()
+    assert run.settings.policy == "other"
+    assert np.mean(np.concatenate([t.actions for t in run.trajectories]) == 3) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("env", "options", "message"),
+    [
+        ("gridwrld", {}, "environment: expected gridworld, .* got 'gridwrld'"),
+        ("gridworld", {"utility": "median"}, "utility: expected one of posterior-mean"),
+        ("gridworld", {"kl_bound": float("nan")}, "kl_bound: expected a positive finite number, got nan"),
+        ("gridworld", {"kl_bund": 0.3}, "settings: expected options among"),
+        ("gridworld", {"policy": "gaussian-process"}, "space"),
+        (42, {}, "environment: expected a short name"),
+    ],
+)
+def test_bad_options_are_refused(env, options, message):
+    with pytest.raises(ValueError, match=message):
+        Learner(env, **options)
+
+
+class Slope(gymnasium.Env):
+    """A point pushed along a line for five steps; returns NaN at the n-th step of its life if told so."""
+
+    observation_space = Box(-10.0, 10.0, (1,), dtype=np.float64)
+    action_space = Box(-1.0, 1.0, (1,), dtype=np.float64)
+
+    def __init__(self, break_at=None):
+        self.break_at, self.life, self.position, self.time = break_at, 0, 0.0, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.position, self.time = self.np_random.normal(0, 0.1), 0
+        return np.array([self.position]), {}
+
+    def step(self, action):
+        self.life, self.time = self.life + 1, self.time + 1
+        self.position += 0.3 * float(np.asarray(action)[0]) + self.np_random.normal(0, 0.02)
+        reward = float("nan") if self.life == self.break_at else self.position
+        return np.array([self.position]), reward, False, self.time >= 5, {}
+
+
+SLOPE = {"utility": "linear-program", "iterations": 2, "max_steps": 5, "evaluation_episodes": 4, "centres": 20}
+
+
+def test_continuous_actions_and_an_ordinary_environment_are_learned_alike():
+    policy = LinearGaussianPolicy.initial(Slope.observation_space, Slope.action_space, initial_scale=0.3)
+    changes = {"utility": "known-reward", "iterations": 6, "evaluation_episodes": 20}
+    run = Learner(Slope(), policy=policy, **(SLOPE | changes)).run(ReturnExpert())
+    assert run.iterations[-1]["value"] > run.iterations[0]["value"]
+    assert run.trajectories[0].states.shape == (6, 1)
+    assert all(np.abs(t.actions).max() <= 1 for t in run.trajectories)
+
+
+@pytest.mark.parametrize(("break_at", "answers"), [(3, 0), (60, 2), (90, 2)])
+def test_a_reward_that_is_not_a_number_is_refused_and_the_run_goes_on_without_loss(break_at, answers):
+    # 50 steps are collected, then 20 of evaluation, and so on.
+    policy = LinearGaussianPolicy.initial(Slope.observation_space, Slope.action_space, initial_scale=0.3)
+    log = Memory()
+    broken = Learner(Slope(break_at), policy=policy, **SLOPE).logged(log)
+    with pytest.raises(ValueError, match=r"environment Slope: expected finite .*NaN or infinity at step"):
+        broken.run(ReturnExpert())
+    assert broken.preferences.answers == answers
+    whole = Learner(Slope(), policy=policy, **SLOPE).run(ReturnExpert())
+    mended = Learner(Slope(), policy=policy, entries=log.entries, **SLOPE).run(ReturnExpert())
+    assert fingerprint(mended) == fingerprint(whole)
+    assert fingerprint(broken.run(ReturnExpert())) == fingerprint(whole)  # it broke only once
+
+
+def test_discrete_actions_in_continuous_states_are_learned():
+    run = Learner("CartPole-v1", utility="linear-program", iterations=2, centres=20, evaluation_episodes=2)
+    assert isinstance(run.environment.action_space, Discrete)
+    run.run(ReturnExpert())
+    assert run.preferences.answers == 3
+    assert all(summary["kl_fitted_policy"] < 0.6 for summary in run.iterations)
+
+
+def compilations_after(run, iteration):
+    """Programs that JAX compiled after the given iteration, until the end."""
+    count = []
+
+    def listen(event, seconds, **details):
+        if event == "/jax/core/compile/backend_compile_duration" and run.state.iteration >= iteration:
+            count.append(seconds)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        run.run(ReturnExpert())
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    return len(count)
+
+
+def test_compilations_do_not_grow_with_the_iterations():
+    jax.clear_caches()
+    assert compilations_after(learner(iterations=3, max_steps=11), 0) > 0  # the counter counts
+    assert compilations_after(learner(iterations=12, max_steps=11), 3) == 0
+
+
+@pytest.mark.slow
+def test_compilations_of_the_sampler_grow_with_its_capacity_only():
+    # 2 to 9 preferences cross at most one power of two after the third iteration
+    assert compilations_after(learner(utility="posterior-mean", iterations=8), 3) <= 8
+    assert compilations_after(learner(utility="posterior-mean", iterations=8, seed=8), 0) == 0
+
+
+@pytest.mark.slow
+def test_a_continued_run_draws_the_same_posterior():
+    changes = {"utility": "posterior-mean", "iterations": 4}
+    straight, log = remembered(**changes)
+    straight.run(ReturnExpert())
+    assert fingerprint(straight)["draws"] is not None
+    for length in range(2, len(log.entries), 5):
+        assert fingerprint(learner(log.entries[:length], **changes).run(ReturnExpert())) == fingerprint(straight)
+
+
+@pytest.mark.slow
+def test_the_gridworld_is_learned_from_preferences():
+    run = Learner("gridworld", iterations=12, seed=1000, evaluation_episodes=50).run(ReturnExpert())
+    assert run.iterations[-1]["value"] > 0.97 * 294.8125

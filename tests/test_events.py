@@ -1,0 +1,159 @@
+"""The state is a fold over the log: pure, and undoing is the same as never having answered."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bayespbrl.events import Entry, LearnerState, apply, plain, replay, surviving
+from bayespbrl.trajectories import Trajectory
+
+
+def some_trajectories(number, seed=0):
+    rng = np.random.default_rng(seed)
+    return tuple(
+        Trajectory(rng.normal(size=(4, 2)), rng.normal(size=(3, 1)), rng.normal(size=3)) for _ in range(number)
+    )
+
+
+def collected(iteration, candidates, wanted=1, seed=0):
+    event = {"event": "collected", "iteration": iteration, "candidates": candidates, "wanted": wanted}
+    return Entry(event, {"trajectories": some_trajectories(len(candidates), seed)})
+
+
+def asked(query, first, second, newcomer):
+    return Entry({"event": "asked", "query": query, "first": first, "second": second, "newcomer": newcomer})
+
+
+def answered(query, answer):
+    return Entry({"event": "answered", "query": query, "answer": answer})
+
+
+def improved(iteration):
+    event = {"event": "improved", "iteration": iteration, "summary": {"iteration": iteration}}
+    return Entry(event, {"policy": f"policy {iteration}", "estimate": f"estimate {iteration}"})
+
+
+UNDONE = Entry({"event": "undone"})
+START = LearnerState("policy 0")
+# Two iterations by hand: 2 beats 0; 1 is worse than 2; then 4 ties with 2.
+HISTORY = (
+    collected(1, [0, 2, 1], wanted=2),
+    asked(1, 2, 0, 2),
+    answered(1, "first"),
+    asked(2, 2, 1, 1),
+    answered(2, "first"),
+    improved(1),
+    collected(2, [4, 3], seed=1),
+    asked(3, 4, 2, 4),
+    answered(3, "tie"),
+    improved(2),
+)
+
+
+def test_two_iterations_by_hand():
+    state = replay(START, HISTORY)
+    assert state.preferences.pairs == ((2, 0), (2, 1))
+    assert state.preferences.undominated == (2, 4)
+    assert state.preferences.answers == 3
+    assert (state.iteration, state.queries, len(state.trajectories)) == (2, 3, 5)
+    assert (state.policy, state.estimate) == ("policy 2", "estimate 2")
+    assert state.summaries == ({"iteration": 1}, {"iteration": 2})
+    assert (state.collected, state.query, state.candidates, state.wanted) == (False, None, (), 0)
+
+
+def test_the_first_candidate_of_a_run_is_what_the_others_are_compared_with():
+    state = replay(START, HISTORY[:1])
+    assert state.preferences.undominated == (0,)
+    assert (state.candidates, state.wanted, state.collected) == ((2, 1), 2, True)
+
+
+def test_a_question_holds_the_two_trajectories_in_the_order_shown():
+    state = replay(START, HISTORY[:4])
+    assert state.query.trajectories == (state.trajectories[2], state.trajectories[1])
+    assert (state.query.newcomer, state.query.incumbent) == (1, 2)
+
+
+def test_a_skip_counts_as_no_answer_and_drops_the_candidate():
+    state = replay(START, (*HISTORY[:2], answered(1, "skip")))
+    assert (state.preferences.answers, state.preferences.pairs, state.wanted) == (0, (), 2)
+    assert (state.candidates, state.query) == ((1,), None)
+
+
+def test_the_fold_changes_nothing_that_it_is_given():
+    state = START
+    for entry in HISTORY:
+        before = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+        event = dict(entry.event)
+        after = apply(state, entry)
+        assert all(getattr(state, name) is value for name, value in before.items())
+        assert entry.event == event
+        assert apply(state, entry).preferences == after.preferences
+        state = after
+
+
+@pytest.mark.parametrize("length", range(3, len(HISTORY) + 1))
+def test_undoing_leads_to_the_state_before_the_last_answer(length):
+    last = max(i for i, entry in enumerate(HISTORY[:length]) if entry.event["event"] == "answered")
+    undone, never = replay(START, (*HISTORY[:length], UNDONE)), replay(START, HISTORY[:last])
+    assert undone.query.number == never.query.number
+    for name in ("policy", "estimate", "iteration", "preferences", "candidates", "wanted", "queries", "summaries"):
+        assert getattr(undone, name) == getattr(never, name)
+    assert len(undone.trajectories) == len(never.trajectories)
+
+
+def test_undoing_works_back_to_the_first_question_and_no_further():
+    state = replay(START, (*HISTORY, UNDONE, UNDONE, UNDONE))
+    assert (state.query.number, state.iteration, state.preferences.answers) == (1, 0, 0)
+    with pytest.raises(ValueError, match="undo: expected an answer to take back"):
+        apply(state, UNDONE)
+
+
+@pytest.mark.parametrize("undone", [0, 1, 2, 3])
+def test_what_survives_leads_to_the_same_state(undone):
+    log = [*HISTORY, *[UNDONE] * undone]
+    left = surviving(entry.event for entry in log)
+    assert [dict(entry.event) for entry in HISTORY[: len(left)]] == left
+    whole, short = replay(START, log), replay(START, HISTORY[: len(left)])
+    assert (whole.preferences, whole.iteration, whole.queries) == (short.preferences, short.iteration, short.queries)
+    assert "undone" not in {event["event"] for event in left}
+
+
+def test_undoing_and_answering_anew_survives_as_the_new_answer():
+    log = [*HISTORY[:5], UNDONE, answered(2, "tie"), improved(1)]
+    left = surviving(entry.event for entry in log)
+    assert [event.get("answer") for event in left if event["event"] == "answered"] == ["first", "tie"]
+    with pytest.raises(ValueError, match="undo"):
+        surviving([UNDONE.event])
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        {"event": "answered", "query": 7, "answer": "first"},
+        {"event": "answered", "query": 1, "answer": "both"},
+        {"event": "answered", "query": 1, "answer": "undo"},
+        {"event": "answered", "query": 1},
+        {"event": "asked", "query": 2, "first": 0, "second": 99, "newcomer": 0},
+        {"event": "asked", "query": 2},
+        {"event": "collected", "candidates": [0], "wanted": 1},
+        {"event": "improved", "iteration": 1},
+        {"event": "burnt"},
+        {},
+    ],
+)
+def test_an_event_that_cannot_follow_is_refused(foreign):
+    with pytest.raises(ValueError, match=r"expected"):
+        replay(START, (*HISTORY[:2], Entry(foreign)))
+
+
+def test_a_second_answer_to_the_same_question_is_refused():
+    with pytest.raises(ValueError, match="answered: expected an answer to None"):
+        replay(START, (*HISTORY[:3], answered(1, "first")))
+
+
+def test_plain_is_what_json_gives_back():
+    numbers = {"a": np.float64(0.1), "b": [np.int64(3), float("nan"), np.inf], "c": (True, None, "x"), "d": np.bool_(1)}
+    assert plain(numbers) == {"a": 0.1, "b": [3, None, None], "c": [True, None, "x"], "d": True}
+    assert type(plain(np.float64(0.1))) is float
+    assert plain(np.bool_(True)) is True
