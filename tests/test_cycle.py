@@ -409,7 +409,7 @@ def test_compilations_do_not_grow_with_the_iterations():
 def test_compilations_of_the_sampler_grow_with_its_capacity_only():
     # 2 to 9 preferences cross at most one power of two after the third iteration
     assert compilations_after(learner(utility="posterior-mean", iterations=8), 3) <= 8
-    assert compilations_after(learner(utility="posterior-mean", iterations=8, seed=8), 0) == 0
+    assert compilations_after(learner(utility="posterior-mean", iterations=8), 0) == 0
 
 
 @pytest.mark.slow
@@ -425,4 +425,5 @@ def test_a_continued_run_draws_the_same_posterior():
 @pytest.mark.slow
 def test_the_gridworld_is_learned_from_preferences():
     run = Learner("gridworld", iterations=12, seed=1000, evaluation_episodes=50).run(ReturnExpert())
-    assert run.iterations[-1]["value"] > 0.97 * 294.8125
+    assert run.iterations[-1]["value"] > 3 * 44.34  # of the uniform policy
+    assert all(summary["rhat_max"] < 1.01 for summary in run.iterations if summary["utility_converged"])
