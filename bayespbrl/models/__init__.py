@@ -1,16 +1,20 @@
 """Densities and how to sample them."""
 
 from bayespbrl.models.elliptical_slice import EllipticalSlice
+from bayespbrl.models.hyperparameters import Candidate, HyperparameterWeights, select_hyperparameters
 from bayespbrl.models.linear_program import LinearProgramResult, linear_program
 from bayespbrl.models.posterior import restored, sample_posterior, stored
 from bayespbrl.models.preference_model import preference_model
 
 __all__ = [
+    "Candidate",
     "EllipticalSlice",
+    "HyperparameterWeights",
     "LinearProgramResult",
     "linear_program",
     "preference_model",
     "restored",
     "sample_posterior",
+    "select_hyperparameters",
     "stored",
 ]

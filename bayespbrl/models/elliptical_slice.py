@@ -1,8 +1,8 @@
 """Elliptical slice sampling for any NumPyro model with Gaussian latent sites (Murray, Adams & MacKay 2010).
 
 A draw is one or more moves x ← c + (x − c) cos α + (ν − c) sin α round an ellipse through the current point and a
-fresh Gaussian ν. With the model's prior as that Gaussian the slice is one of the likelihood; with any other Gaussian reference
-it is one of prior × likelihood / reference, and still exact (Nishihara, Murray & Adams 2014).
+fresh Gaussian ν. With the model's prior as that Gaussian the slice is one of the likelihood; with any other Gaussian
+reference it is one of prior × likelihood / reference, and still exact (Nishihara, Murray & Adams 2014).
 """
 
 import copy
@@ -144,8 +144,8 @@ class EllipticalSlice(MCMCKernel):
     """Elliptical slice sampling of all latent sites of a NumPyro model at once.
 
     The latent sites must have Gaussian priors (Normal, MultivariateNormal, LowRankMultivariateNormal,
-    GaussianRandomWalk, expanded or `to_event`) that do not depend on other latent sites; the likelihood may be anything,
-    also discontinuous.
+    GaussianRandomWalk, expanded or `to_event`) that do not depend on other latent sites; the likelihood may be
+    anything, also discontinuous.
     There is nothing to tune. Composes with `numpyro.infer.Gibbs`: condition on scales and sample them by another block.
 
         mcmc = MCMC(EllipticalSlice(model), num_warmup=500, num_samples=1000)

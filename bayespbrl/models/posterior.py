@@ -29,6 +29,8 @@ from bayespbrl.models.preference_model import (
 REFERENCE_POWER = 0.6
 # Moves round the reference's and the prior's ellipses per recorded draw.
 REFERENCE_MOVES, PRIOR_MOVES = 15, 1
+# Draws that one call of the compiled sampler makes; its length is part of what is compiled.
+CHUNK = 100
 
 
 def sample_posterior(
@@ -41,7 +43,7 @@ def sample_posterior(
     indifferent: np.ndarray | None = None,
     tie_threshold: float | None = None,
     number_of_preferences: int | None = None,
-    num_warmup: int = 250,
+    num_warmup: int = 100,
     num_samples: int = 1000,
     max_samples: int = 16_000,
     num_chains: int = 4,
@@ -63,7 +65,7 @@ def sample_posterior(
         does not matter.
       tie_threshold: δ > 0: margins within it are often called ties. None: no ties, and no threshold.
       number_of_preferences: K of eq. 8, where it is not the number of rows (an answer held out).
-      num_warmup: draws a chain that are thrown away; rounded up to whole chunks of min(num_samples, 250) draws.
+      num_warmup: draws a chain that are thrown away; rounded up to whole chunks of min(num_samples, 100) draws.
       num_samples: draws a chain to begin with, >= 4.
       max_samples: cap on the draws a chain.
       num_chains: >= 2, so that R̂ means something.
@@ -119,7 +121,7 @@ def sample_posterior(
         "seed": int(seed),
     }
     with jax.enable_x64(True):
-        chains = _Chains.start(fit, num_chains=num_chains, chunk=min(num_samples, 250), seed=seed)
+        chains = _Chains.start(fit, num_chains=num_chains, chunk=min(num_samples, CHUNK), seed=seed)
         chains = replace(chains.extended(num_warmup), draws=())
         wanted = num_samples
         while True:
@@ -152,6 +154,7 @@ class GaussianFit:
 
 def fit_gaussian(differences: np.ndarray, *, prior_scale: float, likelihood: Likelihood) -> GaussianFit:
     """Factorise the differences (K, D) and fit a Gaussian by expectation propagation: how `sample_posterior` begins."""
+    differences = _checked(differences, prior_scale=prior_scale)
     factors = low_rank(differences)
     used = np.any(factors.loadings != 0, axis=1)
     mixture = likelihood.probit_mixture()
@@ -191,7 +194,7 @@ class _Chains:
             mean=approximation.mean,
             covariance=(covariance + covariance.T) / 2,
         )
-        # from the reference, which is wider than the posterior's bulk: chains that agree have forgotten where they began
+        # from the reference, which is wider than the posterior's bulk: those that agree have forgotten their start
         noise = np.random.default_rng(seed).standard_normal((num_chains, len(problem.centre)))
         start = problem.centre + noise @ problem.root.T
         start, zeros = jnp.asarray(start), jnp.zeros(num_chains)

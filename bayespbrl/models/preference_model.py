@@ -1,7 +1,7 @@
 """The model of Bayesian PBIRL in NumPyro (eqs. 7-8), and the ellipses that make it fast to sample.
 
 `preference_model` is for any matrix of differences and any NumPyro algorithm. `PreferenceProblem` is the same model
-after the thin factorisation, with a Gaussian reference, padded so that problems of different size share one compilation.
+after the thin factorisation, with a Gaussian reference, padded so that problems of different size share a compilation.
 """
 
 from dataclasses import dataclass

@@ -1,0 +1,179 @@
+"""Effective draws per second of our posterior against blackjax's elliptical slice sampler on the same posterior.
+
+    python benchmarks/elliptical_slice.py --differences differences.npy [--steepness 5] [--prior-scale 1]
+    python benchmarks/elliptical_slice.py --scaling
+
+The differences are divided by their largest absolute entry. Prints one JSON line; `--scaling` prints instead a table of
+seconds to convergence against K and D on differences of random smooth trajectories.
+"""
+
+import argparse
+import json
+import time
+from functools import partial
+from typing import Any
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayespbrl.diagnostics.convergence import convergence
+from bayespbrl.models import sample_posterior
+from bayespbrl.models.likelihoods import Mixed, total_log_prob
+
+
+def report(margins: np.ndarray, seconds: float, compile_seconds: float) -> dict:
+    """The named figures of one sampler; margins (chain, draw, K)."""
+    diagnosis = convergence(margins)
+    return {
+        "draws": int(margins.shape[0] * margins.shape[1]),
+        "seconds": seconds,
+        "compile_seconds": compile_seconds,
+        "min_effective_sample_size": diagnosis.effective_sample_size_min,
+        "max_rhat": diagnosis.rhat_max,
+        "effective_draws_per_second": diagnosis.effective_sample_size_min / seconds,
+    }
+
+
+def ours(differences: np.ndarray, *, steepness: float, prior_scale: float, num_chains: int, seed: int) -> dict:
+    """`sample_posterior` with its default arguments: factorisation, expectation propagation, warm-up and diagnosis."""
+
+    def run(seed: int) -> tuple[np.ndarray, float]:
+        begin = time.perf_counter()
+        tree = sample_posterior(
+            differences, steepness=steepness, prior_scale=prior_scale, num_chains=num_chains, seed=seed
+        )
+        return np.asarray(tree["posterior/margins"]), time.perf_counter() - begin
+
+    _, first = run(seed + 1)
+    margins, seconds = run(seed)
+    return report(margins, seconds, max(first - seconds, 0.0))
+
+
+def theirs(
+    differences: np.ndarray, *, steepness: float, prior_scale: float, num_chains: int, seed: int, max_seconds: float
+) -> dict:
+    """blackjax in the space of w, jitted, chains vectorised, until the smallest effective sample size is 100."""
+    number, dimension = differences.shape
+    likelihood, used = Mixed(steepness, float(number)), jnp.any(differences != 0, axis=1)
+    matrix = jnp.asarray(differences)
+    kernel = blackjax.elliptical_slice(
+        lambda w: total_log_prob(likelihood, matrix @ w, used),
+        mean=jnp.zeros(dimension),
+        cov=prior_scale**2 * jnp.ones(dimension),
+    )
+
+    @partial(jax.jit, static_argnames="length")
+    def advance(key, states, *, length):
+        def chain(key, state):
+            def step(state, key):
+                state, _ = kernel.step(key, state)
+                return state, matrix @ state.position
+
+            return jax.lax.scan(step, state, jax.random.split(key, length))
+
+        return jax.vmap(chain)(jax.random.split(key, num_chains), states)
+
+    key_start, key_compile, key_run = jax.random.split(jax.random.key(seed), 3)
+    start = prior_scale * jax.random.normal(key_start, (num_chains, dimension))
+    states = jax.vmap(kernel.init)(start)
+    length, begin = 1000, time.perf_counter()
+    jax.block_until_ready(advance(key_compile, states, length=length))
+    first = time.perf_counter() - begin
+    margins, seconds, warm_up, chunk = np.zeros((num_chains, 0, number)), 0.0, True, 0
+    check = 1
+    while True:
+        begin = time.perf_counter()
+        states, drawn = jax.block_until_ready(advance(jax.random.fold_in(key_run, chunk), states, length=length))
+        seconds += time.perf_counter() - begin
+        chunk += 1
+        if warm_up:
+            warm_up = False
+            continue
+        margins = np.concatenate([margins, np.asarray(drawn)], axis=1)
+        if chunk > check:
+            check *= 2
+            if convergence(margins).effective_sample_size_min >= 100 or seconds > max_seconds:
+                break
+    return report(margins, seconds, max(first - seconds / chunk, 0.0))
+
+
+def smooth_differences(number: int, dimension: int, *, seed: int, answers: bool = True) -> np.ndarray:
+    """Differences of discounted radial basis features of random smooth trajectories on a circle × a line.
+
+    A hidden smooth utility orders each pair, so that the rows are consistent answers.
+    """
+    rng = np.random.default_rng(seed)
+    steps = np.arange(61)
+    frequencies = rng.uniform(0.02, 0.3, (2 * number, 4, 1))
+    amplitudes = rng.normal(0, 1.2, (2 * number, 4, 1))
+    phase = rng.uniform(0, 2 * np.pi, (2 * number, 4, 1))
+    waves = amplitudes * np.sin(frequencies * steps + phase)
+    angle, speed = np.pi + waves[:, :2].sum(axis=1), waves[:, 2:].sum(axis=1)
+    pick = rng.integers(0, angle.size, dimension)
+    centre_angle, centre_speed = angle.ravel()[pick], speed.ravel()[pick]
+    features = np.zeros((2 * number, dimension))
+    for t in range(1, 61):
+        circle = (np.cos(angle[:, t, None] - centre_angle) - 1) / 0.4**2
+        features += 0.98**t * np.exp(circle - 0.5 * ((speed[:, t, None] - centre_speed) / 0.4) ** 2)
+    utility = np.cos(centre_angle) - 0.1 * centre_speed**2
+    differences = features[:number] - features[number:]
+    signs = np.sign(differences @ utility) if answers else 1.0
+    differences *= np.reshape(signs, (-1, 1))
+    return differences / np.abs(differences).max()
+
+
+def scaling(*, steepness: float, prior_scale: float, num_chains: int, seed: int) -> None:
+    """Print seconds to convergence, compiled, against K at D = 700 and against D at K = 41."""
+    print("|    K |     D | seconds | draws | effective |  R̂ | converged |")
+    print("|-----:|------:|--------:|------:|----------:|----:|:----------|")
+    sizes = [(k, 700) for k in (5, 10, 20, 41, 80, 160, 320)] + [(41, d) for d in (100, 2000, 20_000)]
+    for number, dimension in sizes:
+        differences = smooth_differences(number, dimension, seed=seed)
+        arguments: dict[str, Any] = {"steepness": steepness, "prior_scale": prior_scale, "num_chains": num_chains}
+        sample_posterior(differences, num_samples=1000, num_warmup=0, max_samples=1000, **arguments)
+        begin = time.perf_counter()
+        tree = sample_posterior(differences, seed=seed, **arguments)
+        seconds = time.perf_counter() - begin
+        a = tree.attrs
+        print(
+            f"| {number:4d} | {dimension:5d} | {seconds:7.2f} | {tree['posterior'].sizes['draw']:5d} "
+            f"| {a['effective_sample_size_min']:9.0f} | {a['rhat_max']:.3f} | {bool(a['converged'])} |",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Read the arguments and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--differences", help="NumPy file, shape (K, D)")
+    parser.add_argument("--steepness", type=float, default=5.0)
+    parser.add_argument("--prior-scale", type=float, default=1.0)
+    parser.add_argument("--chains", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--max-seconds", type=float, default=600.0, help="give up on blackjax after this long")
+    parser.add_argument("--scaling", action="store_true", help="print the scaling table instead")
+    options = parser.parse_args()
+    if not options.scaling and not options.differences:
+        parser.error("expected --differences FILE or --scaling")
+    settings = {
+        "steepness": options.steepness,
+        "prior_scale": options.prior_scale,
+        "num_chains": options.chains,
+        "seed": options.seed,
+    }
+    if options.scaling:
+        scaling(**settings)
+        return
+    differences = np.load(options.differences)
+    differences = differences / np.abs(differences).max()
+    with jax.enable_x64(True):
+        mine = ours(differences, **settings)
+        other = theirs(differences, **settings, max_seconds=options.max_seconds)
+    ratio = mine["effective_draws_per_second"] / other["effective_draws_per_second"]
+    print(json.dumps({"ours": mine, "blackjax": other, "ratio": ratio}))
+
+
+if __name__ == "__main__":
+    main()

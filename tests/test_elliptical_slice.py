@@ -1,0 +1,310 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from arviz_base import from_numpyro
+from numpyro.infer import MCMC, NUTS, Gibbs
+from scipy import stats
+
+from bayespbrl.diagnostics.convergence import convergence
+from bayespbrl.models import EllipticalSlice, preference_model
+from bayespbrl.models.likelihoods import Logistic, Mixed
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def regression(x, y):
+    """Two sites of different shape with nonzero means; the posterior is Gaussian and known."""
+    slope = numpyro.sample("slope", dist.Normal(1.0, 2.0).expand([2]).to_event(1))
+    offset = numpyro.sample("offset", dist.MultivariateNormal(jnp.array([-1.0]), jnp.array([[0.25]])))
+    mean = numpyro.deterministic("mean", x @ slope + offset[0])
+    numpyro.sample("y", dist.Normal(mean, 0.5), obs=y)
+
+
+X = np.array([[1.0, 0.2], [0.3, -1.0], [2.0, 1.0]])
+Y = np.array([0.5, 1.0, 3.0])
+
+
+def regression_posterior():
+    # sites in sorted order: offset, slope
+    design = np.column_stack([np.ones(3), X])
+    precision = np.diag([1 / 0.25, 1 / 4, 1 / 4])
+    covariance = np.linalg.inv(precision + design.T @ design / 0.25)
+    return covariance @ (precision @ np.array([-1.0, 1.0, 1.0]) + design.T @ Y / 0.25), covariance
+
+
+def run(kernel, *args, chain_method="vectorized", num_warmup=200, num_samples=2000, num_chains=4, seed=0, **kwargs):
+    mcmc = MCMC(
+        kernel,
+        num_warmup=num_warmup,
+        num_samples=num_samples,
+        num_chains=num_chains,
+        chain_method=chain_method,
+        progress_bar=False,
+    )
+    mcmc.run(jax.random.key(seed), *args, **kwargs)
+    return mcmc
+
+
+@pytest.mark.parametrize(
+    "reference", [None, (np.array([0.0, 1.0, 0.0]), np.diag([0.3, 0.5, 0.4]))], ids=["prior", "reference"]
+)
+def test_posterior_of_a_linear_regression_is_the_known_gaussian(reference):
+    mcmc = run(EllipticalSlice(regression, moves=4, reference=reference), X, Y)
+    z = mcmc.get_samples(group_by_chain=True)
+    draws = np.concatenate([z["offset"], z["slope"]], axis=2)
+    mean, covariance = regression_posterior()
+    report = convergence(draws)
+    assert report.rhat_max < 1.02
+    assert np.all(np.abs(draws.mean((0, 1)) - mean) < 4 * report.monte_carlo_error)
+    np.testing.assert_allclose(np.cov(draws.reshape(-1, 3).T), covariance, atol=0.15 * covariance.max())
+
+
+def exact_draws(key, number, *, steepness, scale, likelihood=None):
+    """Independent draws of w in one dimension under two answers in favour and one against, by inverting its CDF."""
+    likelihood = likelihood or Mixed(steepness, 3.0)
+    # dense round 0, where the likelihood jumps and, steep, has all its mass
+    w = 9 * scale * np.sinh(25 * np.linspace(-1, 1, 400_001)) / np.sinh(25)
+    margins = w[:, None] * np.array([1.0, 0.4, -0.2])
+    exponent, ratio = likelihood.factor(margins)
+    log_density = np.sum(np.asarray(exponent) + np.log(np.asarray(ratio)), axis=1) - 0.5 * (w / scale) ** 2
+    density = np.exp(log_density - log_density.max())
+    cdf = np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(w))
+    cdf = np.concatenate([[0.0], cdf]) / cdf[-1]
+    return np.interp(np.asarray(jax.random.uniform(key, (number,))), cdf, w), lambda x: np.interp(x, w, cdf)
+
+
+def p_value_after_moves(kernel, *, steepness=5.0, scale=1.0, number=100_000, moves=1, model_scale=None):
+    """p of the Kolmogorov–Smirnov test that exact draws, moved, still follow the exact law."""
+    start, cdf = exact_draws(jax.random.key(1), number, steepness=steepness, scale=scale)
+    keys = jax.random.split(jax.random.key(2), number)
+    differences = jnp.array([[1.0], [0.4], [-0.2]])
+    args, kwargs = (differences, Mixed(steepness, 3.0)), {"prior_scale": model_scale or scale}
+
+    @jax.jit
+    def step(key, w):
+        state = kernel.init(key, 0, {"utility_weights": w[None]}, args, kwargs)
+        state = jax.lax.fori_loop(0, moves, lambda _, s: kernel.sample(s, args, kwargs), state)
+        return state.z["utility_weights"][0]
+
+    moved = np.asarray(jax.vmap(step)(keys, jnp.asarray(start)))
+    assert np.mean(moved != start) > 0.99
+    return stats.kstest(moved, cdf).pvalue
+
+
+WIDE = (np.array([0.3]), np.array([[0.6]]))
+
+
+@pytest.mark.parametrize("reference", [None, WIDE], ids=["prior", "reference"])
+@pytest.mark.parametrize(("steepness", "scale"), [(5.0, 1.0), (0.3, 7.0), (60.0, 0.2), (1e4, 1.0)])
+def test_one_step_leaves_the_exact_law_as_it_is(reference, steepness, scale):
+    if reference is not None:
+        reference = (reference[0] * scale, reference[1] * scale**2)
+    assert (
+        p_value_after_moves(EllipticalSlice(preference_model, reference=reference), steepness=steepness, scale=scale)
+        > 1e-3
+    )
+
+
+def test_batched_candidates_leave_the_law_of_a_draw_as_it_is():
+    assert p_value_after_moves(EllipticalSlice(preference_model, batch=1)) > 1e-3
+    assert p_value_after_moves(EllipticalSlice(preference_model, batch=16)) > 1e-3
+
+
+def test_a_kernel_with_the_prior_scale_five_percent_off_is_rejected():
+    assert p_value_after_moves(EllipticalSlice(preference_model), moves=10, model_scale=1.05) < 1e-6
+
+
+@pytest.mark.slow
+def test_a_kernel_that_shrinks_to_the_wrong_side_is_rejected(monkeypatch):
+    from bayespbrl.models import elliptical_slice
+
+    right = elliptical_slice.shrink
+
+    def wrong(angle, low, high, uniforms):
+        # the bracket closes round 1 radian instead of round the current point
+        angles, low, high = right(angle - 1.0, low - 1.0, high - 1.0, uniforms)
+        return angles + 1.0, low + 1.0, high + 1.0
+
+    monkeypatch.setattr(elliptical_slice, "shrink", wrong)
+    assert p_value_after_moves(EllipticalSlice(preference_model), moves=3) < 1e-6
+
+
+def test_a_kernel_that_uses_a_key_twice_is_rejected(monkeypatch):
+    from bayespbrl.models import elliptical_slice
+
+    class Reused:
+        def __getattr__(self, name):
+            return getattr(jax.random, name)
+
+        def split(self, key, number=2):
+            return jnp.stack([key] * number)
+
+    monkeypatch.setattr(elliptical_slice, "random", Reused())
+    assert p_value_after_moves(EllipticalSlice(preference_model)) < 1e-6
+
+
+def test_a_reference_without_its_correction_is_rejected(monkeypatch):
+    def uncorrected(self, x, unravel, key, model_args, model_kwargs):
+        ellipses = right(self, x, unravel, key, model_args, model_kwargs)
+        first, moves = ellipses[0]
+        log_likelihood = jax.vmap(lambda v: self._log_probs(unravel(first.lower(v)), model_args, model_kwargs)[1])
+        return [(first._replace(residual=log_likelihood), moves)]
+
+    right = EllipticalSlice._model_ellipses
+    monkeypatch.setattr(EllipticalSlice, "_model_ellipses", uncorrected)
+    assert p_value_after_moves(EllipticalSlice(preference_model, reference=WIDE), moves=3) < 1e-6
+
+
+def ten_dimensions():
+    rng = np.random.default_rng(3)
+    differences = rng.normal(size=(12, 10)) / 3
+    return jnp.asarray(differences * np.sign(differences @ rng.normal(size=10))[:, None])
+
+
+@pytest.mark.slow
+def test_ten_dimensions_agree_with_nuts_where_the_likelihood_is_smooth():
+    args = (ten_dimensions(), Logistic(5.0))
+    ours = run(EllipticalSlice(preference_model, moves=8), *args, num_samples=4000)
+    theirs = run(NUTS(preference_model), *args, num_warmup=500, num_samples=2000)
+    a, b = (m.get_samples(group_by_chain=True)["margins"] for m in (ours, theirs))
+    error = np.hypot(convergence(a).monte_carlo_error, convergence(b).monte_carlo_error)
+    assert np.all(np.abs(a.mean((0, 1)) - b.mean((0, 1))) < 4.5 * error)
+    np.testing.assert_allclose(a.std((0, 1)), b.std((0, 1)), rtol=0.1)
+
+
+@pytest.mark.slow
+def test_ten_dimensions_agree_with_importance_sampling_under_the_discontinuous_likelihood():
+    differences, likelihood = ten_dimensions(), Mixed(5.0, 12.0)
+    w = np.random.default_rng(0).standard_normal((1_000_000, 10))
+    exponent, ratio = likelihood.factor(w @ np.asarray(differences).T)
+    log_weights = np.sum(np.asarray(exponent) + np.log(np.asarray(ratio)), axis=1)
+    weights = np.exp(log_weights - log_weights.max())
+    weights /= weights.sum()
+    expected = weights @ w
+    expected_error = np.sqrt(weights**2 @ (w - expected) ** 2)
+    draws = run(EllipticalSlice(preference_model, moves=8), differences, likelihood, num_samples=4000)
+    z = draws.get_samples(group_by_chain=True)["utility_weights"]
+    error = np.hypot(convergence(z).monte_carlo_error, expected_error)
+    assert np.all(np.abs(z.mean((0, 1)) - expected) < 4.5 * error)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:There are not enough devices")
+def test_chain_methods_give_the_same_draws():
+    draws = {}
+    for method in ("sequential", "parallel", "vectorized"):
+        mcmc = run(EllipticalSlice(regression), X, Y, chain_method=method, num_chains=2, num_warmup=5, num_samples=20)
+        draws[method] = mcmc.get_samples(group_by_chain=True)["slope"]
+    np.testing.assert_allclose(draws["sequential"], draws["vectorized"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(draws["parallel"], draws["vectorized"], rtol=0, atol=1e-9)
+
+
+def test_a_run_continued_equals_one_long_run():
+    long = run(EllipticalSlice(regression), X, Y, num_warmup=10, num_samples=40)
+    short = run(EllipticalSlice(regression), X, Y, num_warmup=10, num_samples=20)
+    first = short.get_samples(group_by_chain=True)["slope"]
+    short.post_warmup_state = short.last_state
+    short.run(short.last_state.rng_key, X, Y)
+    both = np.concatenate([first, short.get_samples(group_by_chain=True)["slope"]], axis=1)
+    np.testing.assert_allclose(both, long.get_samples(group_by_chain=True)["slope"], rtol=0, atol=1e-9)
+
+
+def test_arviz_reads_sites_deterministics_and_extra_fields():
+    mcmc = run(EllipticalSlice(regression), X, Y, num_samples=50, extra_fields=("candidates", "stuck"))
+    tree = from_numpyro(mcmc)
+    assert set(tree["posterior"].data_vars) == {"slope", "offset", "mean"}
+    assert tree["posterior/slope"].shape == (4, 50, 2)
+    assert tree["observed_data/y"].shape == (3,)
+    assert not mcmc.get_extra_fields()["stuck"].any()
+
+
+def hierarchical(differences, answers):
+    scale = numpyro.sample("scale", dist.LogNormal(0.0, 0.5))
+    steepness = numpyro.sample("steepness", dist.LogNormal(1.0, 0.5))
+    w = numpyro.sample("w", dist.Normal(0, scale).expand([2]).to_event(1))
+    with numpyro.plate("preference", len(answers)):
+        numpyro.sample("answers", dist.Bernoulli(logits=steepness * differences @ w), obs=answers)
+
+
+@pytest.mark.slow
+def test_scale_and_steepness_are_inferred_beside_w_by_gibbs_as_by_nuts_alone():
+    rng = np.random.default_rng(0)
+    differences = rng.normal(size=(15, 2))
+    answers = (rng.uniform(size=15) < 1 / (1 + np.exp(-3 * differences @ np.array([1.0, -0.5])))).astype(int)
+    blocks = [(EllipticalSlice(hierarchical, moves=3), ["w"]), (NUTS(hierarchical), ["scale", "steepness"])]
+    ours = run(
+        Gibbs(blocks), differences, answers, chain_method="sequential", num_warmup=500, num_samples=4000, num_chains=2
+    )
+    alone = run(NUTS(hierarchical), differences, answers, num_warmup=500, num_samples=3000)
+    for site in ("scale", "steepness", "w"):
+        a, b = (m.get_samples(group_by_chain=True)[site] for m in (ours, alone))
+        error = np.hypot(convergence(a).monte_carlo_error, convergence(b).monte_carlo_error)
+        assert np.all(np.abs(a.mean((0, 1)) - b.mean((0, 1))) < 4.5 * error), site
+
+
+def test_a_start_where_the_likelihood_is_zero_or_nan_is_left():
+    def model():
+        x = numpyro.sample("x", dist.Normal(0, 1))
+        numpyro.factor("wall", jnp.where(x > 1, jnp.nan, jnp.where(x < -1, -jnp.inf, 0.0)))
+
+    for start in (3.0, -3.0):
+        mcmc = run(
+            EllipticalSlice(model), num_chains=1, num_samples=100, num_warmup=5, init_params={"x": jnp.array(start)}
+        )
+        assert np.all(np.abs(mcmc.get_samples()["x"]) <= 1)
+
+
+def test_a_move_without_an_acceptable_candidate_stays_and_says_so():
+    def model():
+        x = numpyro.sample("x", dist.Normal(0, 1).expand([2]).to_event(1))
+        numpyro.factor("nowhere", jnp.where(jnp.all(x == 0.25), 0.0, -jnp.inf))
+
+    start = {"x": jnp.full(2, 0.25)}
+    mcmc = run(
+        EllipticalSlice(model, max_candidates=16),
+        num_chains=1,
+        num_warmup=0,
+        num_samples=3,
+        init_params=start,
+        extra_fields=("stuck",),
+    )
+    assert np.all(mcmc.get_extra_fields()["stuck"])
+    np.testing.assert_array_equal(mcmc.get_samples()["x"], np.full((3, 2), 0.25))
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (lambda: numpyro.sample("x", dist.Gamma(1.0, 1.0)), "Gamma at site 'x'"),
+        (lambda: numpyro.sample("x", dist.LogNormal(0.0, 1.0)), "LogNormal at site 'x'"),
+        (lambda: None, "at least one latent"),
+        (lambda: numpyro.sample("x", dist.Normal(numpyro.sample("m", dist.Normal(0, 1)), 1)), "depending on"),
+    ],
+)
+def test_a_model_without_independent_gaussian_sites_is_refused(prior, message):
+    def model():
+        prior()
+        numpyro.sample("y", dist.Normal(0, 1), obs=0.5)
+
+    with pytest.raises(ValueError, match=message):
+        EllipticalSlice(model).init(jax.random.key(0), 0, None, (), {})
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match="moves: expected"):
+        EllipticalSlice(regression, moves=0)
+    with pytest.raises(ValueError, match="init_params: expected names"):
+        EllipticalSlice(regression).init(jax.random.key(0), 0, {"nope": jnp.zeros(2)}, (X, Y), {})
+
+
+def test_single_precision_programs_keep_their_precision():
+    with jax.enable_x64(False):
+        mcmc = run(EllipticalSlice(regression), X.astype(np.float32), Y.astype(np.float32), num_samples=10)
+        assert mcmc.get_samples()["slope"].dtype == jnp.float32

@@ -1,0 +1,92 @@
+import jax
+import numpy as np
+import pytest
+from scipy import integrate
+
+from bayespbrl.models.expectation_propagation import expectation_propagation, tilted_moments
+from bayespbrl.models.likelihoods import Logistic, Mixed, Probit, WithLapses, WithTies, log_prob
+
+LIKELIHOODS = [Mixed(5.0, 3.0), Mixed(200.0, 41.0), Mixed(0.01, 2.0), Logistic(3.0), WithLapses(Mixed(5.0, 3.0), 0.2)]
+
+
+@pytest.mark.parametrize("likelihood", LIKELIHOODS)
+@pytest.mark.parametrize(("mean", "deviation"), [(0.4, 1.0), (-2.0, 0.7), (0.3, 0.001), (30.0, 20.0)])
+def test_tilted_moments_agree_with_quadrature_at_any_steepness(likelihood, mean, deviation):
+    def density(t):
+        with jax.enable_x64(True):
+            p = np.exp(np.asarray(log_prob(likelihood, t)))
+        return p * np.exp(-0.5 * ((t - mean) / deviation) ** 2) / np.sqrt(2 * np.pi) / deviation
+
+    # panels that end at the jump and shrink towards it
+    near = np.geomspace(1e-7, 1, 60) * (abs(mean) + 12 * deviation)
+    edges = np.unique(np.concatenate([-near, [0.0], near, mean + deviation * np.linspace(-12, 12, 97)]))
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    t = (edges[:-1, None] + edges[1:, None]) / 2 + np.diff(edges)[:, None] / 2 * nodes
+    values = density(t.ravel()) * (np.diff(edges)[:, None] / 2 * weights).ravel()
+    t = t.ravel()
+    total = values.sum()
+    first = values @ t / total
+    second = values @ (t - first) ** 2 / total
+    log_z, tilted_mean, variance = tilted_moments(
+        np.array([mean]), np.array([deviation**2]), likelihood.probit_mixture()
+    )
+    np.testing.assert_allclose(log_z, np.log(total), atol=1e-9)
+    np.testing.assert_allclose(tilted_mean, first, atol=1e-8 * deviation)
+    np.testing.assert_allclose(variance, second, rtol=1e-6)
+
+
+@pytest.mark.parametrize("likelihood", LIKELIHOODS)
+def test_one_answer_is_exact(likelihood):
+    loadings = np.array([[0.8]])
+    fit = expectation_propagation(loadings, likelihood.probit_mixture(), prior_scale=2.0)
+    log_z, mean, variance = tilted_moments(np.zeros(1), np.array([1.6**2]), likelihood.probit_mixture())
+    assert fit.converged
+    np.testing.assert_allclose(fit.log_evidence, log_z[0], atol=1e-10)
+    np.testing.assert_allclose(fit.mean * 0.8, mean, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(fit.covariance[0] * 0.64, variance, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "tolerance"), [(Mixed(5.0, 3.0), 0.2), (Probit(2.0), 0.02), (Logistic(5.0), 0.05)]
+)
+def test_evidence_and_mean_agree_with_quadrature_for_three_answers(likelihood, tolerance):
+    loadings = np.array([[1.0, 0.3], [0.5, -1.0], [-0.2, 0.4]])
+    grid = np.linspace(-6, 6, 1201)
+    z = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+    with jax.enable_x64(True):
+        log_joint = np.asarray(log_prob(likelihood, z @ loadings.T)).sum(axis=1) - 0.5 * np.sum(z**2, axis=1)
+    weights = np.exp(log_joint) / (2 * np.pi) * (grid[1] - grid[0]) ** 2
+    fit = expectation_propagation(loadings, likelihood.probit_mixture(), prior_scale=1.0)
+    assert fit.converged
+    assert abs(fit.log_evidence - np.log(weights.sum())) < tolerance
+    np.testing.assert_allclose(fit.mean, weights @ z / weights.sum(), atol=tolerance)
+
+
+def test_contradictory_answers_leave_a_proper_gaussian():
+    loadings = np.array([[1.0], [-1.0], [1.0], [-1.0]]) * 3
+    for likelihood in LIKELIHOODS:
+        fit = expectation_propagation(loadings, likelihood.probit_mixture(), prior_scale=1.0)
+        assert np.all(np.linalg.eigvalsh(fit.covariance) > 0)
+        np.testing.assert_allclose(fit.mean, 0, atol=1e-6)
+
+
+def test_no_answers_leave_the_prior():
+    fit = expectation_propagation(np.zeros((0, 2)), Mixed(5.0, 1.0).probit_mixture(), prior_scale=3.0)
+    np.testing.assert_allclose(fit.covariance, 9 * np.eye(2))
+    assert fit.log_evidence == 0
+    assert fit.converged
+
+
+def test_a_tie_pulls_the_margin_to_zero():
+    likelihood = WithTies(Logistic(20.0), 0.1, np.array([True]))
+    fit = expectation_propagation(np.ones((1, 1)), likelihood.probit_mixture(), prior_scale=1.0)
+    expected, _ = integrate.quad(
+        lambda t: np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi) * _tie(20.0, 0.1, t), -8, 8, points=[-0.1, 0.1]
+    )
+    np.testing.assert_allclose(fit.log_evidence, np.log(expected), atol=1e-8)
+    np.testing.assert_allclose(fit.mean, 0, atol=1e-9)
+    assert fit.covariance[0, 0] < 0.05
+
+
+def _tie(steepness, threshold, t):
+    return 1 / (1 + np.exp(-steepness * (t + threshold))) - 1 / (1 + np.exp(-steepness * (t - threshold)))

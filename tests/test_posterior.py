@@ -1,0 +1,287 @@
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+from scipy.special import logsumexp
+
+from bayespbrl.diagnostics.convergence import convergence
+from bayespbrl.models import Candidate, posterior, restored, sample_posterior, select_hyperparameters, stored
+from bayespbrl.models.likelihoods import Mixed, log_prob
+from bayespbrl.models.low_rank import low_rank
+from bayespbrl.models.posterior import _ellipses, _run, fit_gaussian
+from bayespbrl.models.preference_model import low_rank_model, padded_problem
+
+
+def consistent(number, dimension, seed=0):
+    rng = np.random.default_rng(seed)
+    differences = rng.normal(size=(number, dimension)) / np.sqrt(dimension)
+    return differences * np.sign(differences @ rng.normal(size=dimension))[:, None]
+
+
+@pytest.fixture(scope="module")
+def tree():
+    return sample_posterior(consistent(6, 9), seed=3)
+
+
+def test_low_rank_keeps_zero_rows_at_zero_and_small_rows_at_their_size():
+    differences = consistent(6, 9)
+    differences[2] = 0
+    differences[3] *= 1e-12
+    differences[5] = differences[4]
+    factors = low_rank(differences)
+    assert factors.loadings.shape == (6, 4)
+    assert np.all(factors.loadings[2] == 0)
+    np.testing.assert_allclose(factors.basis.T @ factors.basis, np.eye(4), atol=1e-13)
+    np.testing.assert_allclose(factors.loadings @ factors.basis.T, differences, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(factors.loadings[3] @ factors.basis.T, differences[3], rtol=1e-9)
+
+
+def test_no_preferences_give_the_prior():
+    tree = sample_posterior(np.zeros((0, 3)), prior_scale=2.0, num_samples=500)
+    w = tree["posterior/utility_weights"].values
+    assert tree.attrs["log_evidence"] == 0
+    assert tree.attrs["converged"]
+    assert stats.kstest(w.ravel(), stats.norm(scale=2).cdf).pvalue > 1e-3
+    assert np.all(tree["utility_weights_mean"].values == 0)
+
+
+def test_one_preference_gives_the_sigmoid():
+    # in one dimension: p(w) ∝ N(w; 0, σ²) sigmoid(m d w)
+    tree = sample_posterior(np.array([[0.7]]), prior_scale=1.5, steepness=2.0)
+    w = np.linspace(-12, 12, 100_001)
+    density = np.exp(-0.5 * (w / 1.5) ** 2) / (1 + np.exp(-2 * 0.7 * w))
+    cdf = np.cumsum(density) / density.sum()
+    draws = tree["posterior/utility_weights"].values.ravel()
+    assert stats.kstest(draws[::4], lambda x: np.interp(x, w, cdf)).pvalue > 1e-3
+    np.testing.assert_allclose(tree.attrs["log_evidence"], np.log(0.5), atol=1e-9)
+
+
+def test_two_dimensions_agree_with_quadrature():
+    differences = np.array([[1.0, 0.3], [0.5, -1.0], [-0.2, 0.4], [1.0, 0.3]])
+    tree = sample_posterior(differences, prior_scale=1.3, steepness=4.0, num_samples=4000)
+    grid = np.linspace(-8, 8, 1601)
+    w = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+    with jax.enable_x64(True):
+        log_p = np.asarray(log_prob(Mixed(4.0, 4.0), w @ differences.T)).sum(axis=1)
+    log_p -= 0.5 * np.sum(w**2, axis=1) / 1.3**2
+    p = np.exp(log_p - logsumexp(log_p))
+    margins = tree["posterior/margins"].values
+    report = convergence(margins)
+    # half the grid's spacing for the sums across the jumps
+    np.testing.assert_array_less(
+        np.abs(margins.mean((0, 1)) - p @ (w @ differences.T)), 4.5 * report.monte_carlo_error + 2e-3
+    )
+    expected = np.mean(tree["posterior/margins"].values > 0, axis=(0, 1))
+    np.testing.assert_allclose(p @ (w @ differences.T > 0), expected, atol=0.02)
+
+
+def test_zero_rows_have_margin_zero_and_factor_one_half():
+    differences = np.concatenate([consistent(3, 4), np.zeros((2, 4))])
+    tree = sample_posterior(differences, num_samples=200, max_samples=200)
+    assert np.all(tree["posterior/margins"].values[:, :, 3:] == 0)
+    np.testing.assert_allclose(tree["log_likelihood/answers"].values[:, :, 3:], np.log(0.5))
+    only = sample_posterior(np.zeros((2, 4)), num_samples=100)
+    np.testing.assert_allclose(only.attrs["log_evidence"], 2 * np.log(0.5))
+    assert only.attrs["converged"]
+
+
+@pytest.mark.parametrize("likelihood", ["mixed", "logistic", "probit"])
+def test_duplicate_and_contradictory_answers_are_fine(likelihood):
+    row = consistent(1, 5)
+    differences = np.concatenate([row, row, -row, -row])
+    tree = sample_posterior(differences, likelihood=likelihood, lapse_rate=0.1)
+    margin = tree["posterior/margins"].values[:, :, 0]
+    np.testing.assert_allclose(tree["posterior/margins"].values[:, :, 3], -margin, atol=1e-12)
+    assert abs(margin.mean()) < 5 * convergence(margin[:, :, None]).monte_carlo_error[0]
+    assert tree.attrs["converged"]
+
+
+def test_ties_pull_the_margin_to_zero():
+    differences = np.array([[1.0, 0.0], [0.0, 1.0]])
+    tree = sample_posterior(differences, tie_threshold=0.2, indifferent=np.array([False, True]), likelihood="logistic")
+    spread = tree["posterior/margins"].values.std((0, 1))
+    assert spread[1] < 0.6 * spread[0]
+    np.testing.assert_array_equal(tree["observed_data/answers"], [1, 0])
+
+
+def test_draws_of_w_have_their_margins_and_the_priors_noise_elsewhere(tree):
+    differences = tree["constant_data/differences"].values
+    w = tree["posterior/utility_weights"].isel(draw=slice(0, 500)).values
+    np.testing.assert_allclose(w @ differences.T, tree["posterior/margins"].values[:, :500], atol=1e-12)
+    basis = low_rank(differences).basis
+    complement = w - (w @ basis) @ basis.T
+    # three dimensions are left of nine: the squared norm is χ²₃
+    assert stats.kstest(np.sum(complement**2, axis=2).ravel(), stats.chi2(3).cdf).pvalue > 1e-3
+
+
+def test_weights_are_the_same_however_they_are_indexed(tree):
+    weights = tree["posterior/utility_weights"]
+    some = weights.values
+    np.testing.assert_array_equal(weights.isel(chain=1, draw=7).values, some[1, 7])
+    np.testing.assert_array_equal(weights.isel(draw=[5, 2], feature=slice(1, 8, 3)).values, some[:, [5, 2], 1:8:3])
+    np.testing.assert_array_equal(weights.isel(chain=0, draw=-1, feature=4).values, some[0, -1, 4])
+
+
+def test_mean_lies_in_the_row_space_and_most_likely_is_the_best_draw(tree):
+    differences = tree["constant_data/differences"].values
+    margins = tree["posterior/margins"].values
+    np.testing.assert_allclose(differences @ tree["utility_weights_mean"].values, margins.mean((0, 1)), atol=1e-12)
+    best = margins.reshape(-1, 6)[np.argmax(tree["sample_stats/lp"].values.ravel())]
+    np.testing.assert_allclose(differences @ tree["utility_weights_most_likely"].values, best, atol=1e-12)
+    basis = low_rank(differences).basis
+    for name in ("utility_weights_mean", "utility_weights_most_likely"):
+        w = tree[name].values
+        np.testing.assert_allclose(basis @ (basis.T @ w), w, atol=1e-12)
+
+
+def test_a_tree_on_disk_comes_back_whole(tree, tmp_path):
+    assert "utility_weights" not in stored(tree)["posterior"]
+    stored(tree).to_netcdf(tmp_path / "posterior.nc", engine="h5netcdf")
+    with xr.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as opened:
+        back = restored(opened.load())
+    xr.testing.assert_identical(back["posterior/margins"], tree["posterior/margins"])
+    np.testing.assert_array_equal(
+        back["posterior/utility_weights"].isel(draw=3).values, tree["posterior/utility_weights"].isel(draw=3).values
+    )
+    assert {k: v for k, v in back.attrs.items() if v == v} == {k: v for k, v in tree.attrs.items() if v == v}
+
+
+def test_the_same_seed_gives_the_same_draws(tree):
+    again = sample_posterior(consistent(6, 9), seed=3)
+    np.testing.assert_array_equal(again["posterior/margins"], tree["posterior/margins"])
+    other = sample_posterior(consistent(6, 9), seed=4)
+    assert not np.any(other["posterior/margins"].values == tree["posterior/margins"].values)
+
+
+def test_what_does_not_converge_says_so():
+    tree = sample_posterior(consistent(40, 60), num_samples=8, max_samples=16, num_warmup=0)
+    assert not tree.attrs["converged"]
+    assert tree["posterior"].sizes["draw"] == 16
+
+
+def test_results_are_float64_and_the_global_flag_is_left_alone(tree):
+    assert not jax.config.jax_enable_x64
+    assert tree["posterior/margins"].dtype == np.float64
+    assert np.abs(tree["posterior/margins"].values.astype(np.float32) - tree["posterior/margins"].values).max() > 0
+
+
+def test_ellipses_of_the_low_rank_problem_have_the_models_density():
+    differences = consistent(6, 9)
+    fit = fit_gaussian(differences, prior_scale=1.7, likelihood=Mixed(5.0, 6.0))
+    with jax.enable_x64(True):
+        problem = padded_problem(
+            fit.factors.loadings,
+            Mixed(5.0, 6.0),
+            prior_scale=1.7,
+            mean=np.arange(6.0),
+            covariance=np.diag(1 + np.arange(6.0)),
+        )
+        kernel = posterior.EllipticalSlice(low_rank_model)
+        z = np.random.default_rng(0).standard_normal((20, 8))
+        joint = np.array([sum(kernel._log_probs({"utility_weights": x}, (problem,), {})) for x in z])
+        likelihood = np.array([kernel._log_probs({"utility_weights": x}, (problem,), {})[1] for x in z])
+        (reference, _), (prior, _) = _ellipses((problem,), {})
+        residual = np.asarray(reference.residual(jax.vmap(reference.lift)(z)))
+        inside = stats.multivariate_normal(problem.centre, problem.root @ problem.root.T).logpdf(z)
+        np.testing.assert_allclose(np.diff(residual), np.diff(joint - inside), rtol=1e-9)
+        np.testing.assert_allclose(prior.residual(jax.vmap(prior.lift)(z)), likelihood, rtol=1e-9)
+
+
+def test_chains_started_in_the_far_tail_forget_it():
+    differences = consistent(20, 40)
+    fit = fit_gaussian(differences, prior_scale=1.0, likelihood=Mixed(5.0, 20.0))
+    with jax.enable_x64(True):
+        chains = posterior._Chains.start(fit, num_chains=4, chunk=100, seed=0)
+        far = {
+            "utility_weights": np.asarray(chains.state.z["utility_weights"]) * 0 + np.array([[30], [-30], [8], [-8]])
+        }
+        state, _, _ = _run(chains.state._replace(z=far), chains.problem, length=100)
+        _, states, _ = _run(state, chains.problem, length=1000)
+    margins = np.asarray(states.z["utility_weights"])[:, :, :20] @ fit.factors.loadings.T
+    expected = sample_posterior(differences, num_samples=4000)["posterior/margins"].values
+    error = np.hypot(convergence(margins).monte_carlo_error, convergence(expected).monte_carlo_error)
+    assert convergence(margins).rhat_max < 1.02
+    assert np.all(np.abs(margins.mean((0, 1)) - expected.mean((0, 1))) < 4.5 * error)
+
+
+@pytest.mark.slow
+def test_forty_iterations_compile_the_sampler_at_most_five_times():
+    before = _run._cache_size()
+    differences = consistent(41, 60)
+    for number in range(2, 42):
+        sample_posterior(differences[:number], num_samples=100, max_samples=100, num_warmup=0)
+    assert _run._cache_size() - before <= 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "dimension", "scale", "steepness"), [(3, 2, 1.0, 5.0), (8, 20, 3.0, 0.7)])
+def test_simulation_based_calibration_of_the_margins(number, dimension, scale, steepness):
+    rng = np.random.default_rng(number)
+    ranks = []
+    for trial in range(200):
+        differences = rng.normal(size=(number, dimension)) / np.sqrt(dimension)
+        w = scale * rng.normal(size=dimension)
+        with jax.enable_x64(True):
+            p = np.exp(np.asarray(log_prob(Mixed(steepness, float(number)), differences @ w)))
+        signs = np.where(rng.uniform(size=number) < p, 1.0, -1.0)
+        tree = sample_posterior(
+            differences * signs[:, None],
+            prior_scale=scale,
+            steepness=steepness,
+            num_samples=100,
+            max_samples=100,
+            seed=trial,
+        )
+        # a fixed direction of w: margins flipped by their own answer would be no function of w alone
+        drawn = tree["posterior/utility_weights"].isel(feature=0).values.ravel()[::4]
+        ranks.append(np.sum(drawn < w[0]))
+    counts, _ = np.histogram(ranks, bins=np.linspace(-0.5, 100.5, 6))
+    assert stats.chisquare(counts, 200 * np.diff(np.ceil(np.linspace(-0.5, 100.5, 6))) / 101).pvalue > 1e-3
+
+
+def test_evidence_finds_the_length_scale_that_ordered_the_pairs():
+    rng = np.random.default_rng(1)
+    points, centres = rng.uniform(-3, 3, (120, 1)), np.linspace(-3, 3, 60)
+    features = {s: np.exp(-0.5 * ((points - centres) / s) ** 2) for s in (0.05, 0.7, 20.0)}
+    utility = features[0.7] @ rng.normal(size=60)
+    candidates = []
+    for length_scale in features:
+        difference = features[length_scale][:60] - features[length_scale][60:]
+        difference *= np.sign(utility[:60] - utility[60:])[:, None]
+        candidates.append(Candidate(difference / np.abs(difference).max()))
+    result = select_hyperparameters(candidates)
+    assert result.best == 1
+    assert result.weights[1] > 0.9
+    np.testing.assert_allclose(result.weights.sum(), 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"differences": np.ones(3)}, "differences: expected shape"),
+        ({"differences": np.array([[1.0, np.nan]])}, "differences: expected finite"),
+        ({"prior_scale": 0.0}, "prior_scale: expected"),
+        ({"prior_scale": np.inf}, "prior_scale: expected"),
+        ({"steepness": -1.0}, "steepness: expected"),
+        ({"lapse_rate": 1.0}, "lapse_rate: expected"),
+        ({"likelihood": "other"}, "likelihood: expected"),
+        ({"num_chains": 1}, "num_chains: expected"),
+        ({"num_samples": 0}, "num_samples: expected"),
+        ({"max_samples": 10, "num_samples": 20}, "max_samples: expected"),
+        ({"seed": -1}, "seed: expected"),
+        ({"indifferent": np.array([True, False])}, "tie_threshold: expected"),
+        ({"indifferent": np.array([True]), "tie_threshold": 0.1}, "indifferent: expected"),
+        ({"tie_threshold": 0.0}, "tie_threshold: expected"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        sample_posterior(**{"differences": np.ones((2, 3)), **arguments})
+
+
+def test_candidates_about_different_answers_are_refused():
+    with pytest.raises(ValueError, match="candidates: expected the same number"):
+        select_hyperparameters([Candidate(np.ones((2, 3))), Candidate(np.ones((3, 3)))])
+    with pytest.raises(ValueError, match="candidates: expected at least one"):
+        select_hyperparameters([])
