@@ -1,0 +1,613 @@
+"""A run on disk: what it holds, that it comes back bit for bit, and what happens to damaged ones."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+
+import bayespbrl
+from bayespbrl import Learner, ReturnExpert, runs
+from bayespbrl.policies import TabularPolicy
+from bayespbrl.runs import RunDirectory
+
+QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
+FILES = {"settings.json", "events.jsonl", "summary.json", "iterations"}
+
+
+def start(directory, **changes):
+    return bayespbrl.start("gridworld", directory, **(QUICK | changes))
+
+
+def fingerprint(learner):
+    """Everything that must come out the same, bit for bit."""
+    posterior = getattr(learner.estimate, "posterior", None)
+    return {
+        "summaries": [{k: v for k, v in s.items() if k != "seconds"} for s in learner.iterations],
+        "policy": [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
+        "trajectories": [
+            (t.states.tobytes(), t.actions.tobytes(), t.rewards.tobytes(), t.terminated) for t in learner.trajectories
+        ],
+        "preferences": learner.preferences,
+        "weights": None if learner.estimate is None else np.asarray(learner.estimate.weights).tobytes(),
+        "draws": None if posterior is None else posterior["posterior"]["coordinates"].values.tobytes(),
+    }
+
+
+def contents(directory):
+    return {
+        str(path.relative_to(directory)): path.read_bytes() for path in sorted(directory.rglob("*")) if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """The run that was never stopped, and never written."""
+    return fingerprint(Learner("gridworld", **QUICK).run(ReturnExpert()))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished run; not to be changed."""
+    directory = tmp_path_factory.mktemp("runs") / "finished"
+    start(directory).run(ReturnExpert())
+    return directory
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    return Path(shutil.copytree(finished, tmp_path / "copy"))
+
+
+def events(directory):
+    return [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]
+
+
+def test_a_run_directory_holds_what_it_should(finished):
+    assert {path.name for path in finished.iterdir()} == FILES
+    assert {path.name for path in (finished / "iterations").iterdir()} == {"0001.nc", "0002.nc", "0003.nc"}
+    settings = json.loads((finished / "settings.json").read_text())
+    assert settings["format"] == 1
+    assert settings["version"] == "0.1.0"
+    assert {name: settings[name] for name in QUICK} == QUICK
+    assert settings["env"] == "gridworld"
+
+
+def test_every_question_with_its_order_and_every_answer_is_in_the_log(finished):
+    log = events(finished)
+    first = ["collected", "asked", "answered", "asked", "answered", "improved"]
+    assert [e["event"] for e in log] == first + 2 * ["collected", "asked", "answered", "improved"]
+    asked = [e for e in log if e["event"] == "asked"]
+    answered = [e for e in log if e["event"] == "answered"]
+    assert [e["query"] for e in asked] == [e["query"] for e in answered] == [1, 2, 3, 4]
+    assert all(e["newcomer"] in (e["first"], e["second"]) for e in asked)
+    trajectories = bayespbrl.load(finished).trajectories
+    for question, answer in zip(asked, answered, strict=True):
+        both = (trajectories[question["first"]], trajectories[question["second"]])
+        assert answer["answer"] == ReturnExpert()(*both)
+
+
+def test_the_summary_lists_the_iterations(finished):
+    summary = json.loads((finished / "summary.json").read_text())
+    named = ["iteration", "answers", "pairs", "pairs_satisfied", "value", "kl_bound", "kl", "kl_fitted_policy"]
+    named += ["feature_gap", "rank_kept", "temperature", "rhat_max", "effective_sample_size_min", "seconds"]
+    assert all(set(named) <= set(iteration) for iteration in summary["iterations"])
+    assert [iteration["iteration"] for iteration in summary["iterations"]] == [1, 2, 3]
+    assert [iteration["answers"] for iteration in summary["iterations"]] == [2, 3, 4]
+    assert (summary["finished"], summary["answers"]) == (True, 4)
+    assert summary["iterations"] == bayespbrl.load(finished).iterations
+
+
+def test_the_files_of_the_iterations_are_netcdf_and_nothing_is_pickled(finished):
+    for number in (1, 2, 3):
+        with xr.open_datatree(finished / "iterations" / f"000{number}.nc", engine="h5netcdf") as tree:
+            assert set(tree.children) == {"trajectories", "policy", "utility"}
+            states = tree["trajectories"]["states"]
+            assert (states.dims, states.shape) == (("trajectory", "time"), (10, 21))
+            assert tree["policy"]["table"].dtype == np.float64
+    for path, content in contents(finished).items():
+        start = content[:4]
+        assert start[1:] == b"HDF" if path.endswith(".nc") else start[:1] == b"{"
+
+
+def test_what_is_loaded_is_what_was_learned(finished, straight):
+    run = bayespbrl.load(finished)
+    assert fingerprint(run.learner) == straight
+    assert run.preferences.answers == 4
+    assert len(run.trajectories) == 30
+    assert run.settings.kl_bound == 0.3
+    assert run.posterior is None
+    assert run.estimate.quality.status == "Optimal"
+    assert run.estimate.utilities(np.arange(25)).shape == (25,)
+
+
+def test_loading_changes_nothing(finished):
+    before = contents(finished)
+    run = bayespbrl.load(finished)
+    run.evaluate(2)
+    assert contents(finished) == before
+
+
+def test_the_policy_acts(finished):
+    policy = bayespbrl.load(finished).policy
+    actions = [policy.act(state) for state in range(25)]
+    assert all(type(action) is int and 0 <= action < 5 for action in actions)
+    key = jax.random.key(3)
+    assert policy.act(np.int64(12), key=key) == policy.act(12, key=key) == policy(12, key=key)
+
+
+def test_evaluation_is_a_function_of_the_seed(finished):
+    run = bayespbrl.load(finished)
+    assert run.evaluate(5, seed=1) == run.evaluate(5, seed=1) == bayespbrl.load(finished).evaluate(5, seed=1)
+    assert run.evaluate(5, seed=1) != run.evaluate(5, seed=2)
+
+
+def test_a_directory_appears_with_its_settings_in_it_or_not_at_all(tmp_path, monkeypatch):
+    seen = []
+    write = runs._write
+    monkeypatch.setattr(runs, "_write", lambda file, text: seen.append(file) or write(file, text))
+    learner = start(tmp_path / "deep" / "run")
+    assert seen[0].parent != tmp_path / "deep" / "run"  # written aside
+    assert {path.name for path in (tmp_path / "deep").iterdir()} == {"run"}
+    assert {path.name for path in (tmp_path / "deep" / "run").iterdir()} == {"settings.json", "iterations"}
+    assert learner.state.trajectories == ()
+
+    def full(file, text):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(runs, "_write", full)
+    with pytest.raises(ValueError, match=r"other: cannot make a run directory there \(no space left"):
+        start(tmp_path / "other")
+    assert {path.name for path in tmp_path.iterdir()} == {"deep"}
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "run", "dangling link"])
+def test_a_path_that_exists_is_refused_and_nothing_changed(tmp_path, finished, kind):
+    path = tmp_path / "taken"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "file":
+        path.write_text("mine")
+    elif kind == "run":
+        shutil.copytree(finished, path)
+    else:
+        path.symlink_to(tmp_path / "nowhere")
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match=r"taken: expected a run directory that does not exist yet"):
+        start(path)
+    assert contents(tmp_path) == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["taken"]
+
+
+def test_bad_options_leave_nothing_behind(tmp_path):
+    for changes in ({"kl_bound": -1}, {"iterations": 0}, {"colour": "red"}):
+        with pytest.raises(ValueError, match="expected"):
+            start(tmp_path / "run", **changes)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_directory_a_fresh_one_is_made_under_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    one, two = start(None), start(None)
+    assert one.settings == two.settings
+    names = sorted(path.name for path in (tmp_path / "runs").iterdir())
+    assert len(names) == 2
+    assert all(name.startswith("gridworld-2") for name in names)
+
+
+def test_a_run_continued_from_disk_between_any_two_calls_is_the_one_never_stopped(tmp_path, straight):
+    directory = tmp_path / "run"
+    start(directory)
+    asked = []
+    while True:
+        questions = runs.resume(directory).ask()
+        if not questions:
+            break
+        assert runs.resume(directory).ask()[0].number == questions[0].number  # the same, asked again
+        (query,) = questions
+        asked.append(query.number)
+        learner = runs.resume(directory)
+        learner.ask()
+        learner.tell([ReturnExpert()(*query.trajectories)])
+    assert asked == [1, 2, 3, 4]
+    assert fingerprint(bayespbrl.load(directory).learner) == straight
+
+
+def test_a_run_in_progress_can_be_read_at_any_time(tmp_path):
+    directory = tmp_path / "run"
+    learner = start(directory)
+    states = []
+
+    def look(learner):
+        before = contents(directory)
+        run = bayespbrl.load(directory)
+        assert contents(directory) == before
+        states.append((run.preferences.answers, len(run.iterations), len(run.trajectories)))
+
+    look(learner)
+    learner.ask()
+    look(learner)
+    bayespbrl.load(directory).policy.act(3)  # the first policy, before the first iteration
+    assert bayespbrl.load(directory).estimate is None
+    learner.run(ReturnExpert(), progress=look)
+    assert states == [(0, 0, 0), (0, 0, 10), (1, 0, 10), (2, 1, 20), (3, 2, 30), (4, 3, 30)]
+
+
+def test_a_finished_run_is_finished_when_resumed(copy):
+    before = contents(copy)
+    learner = runs.resume(copy)
+    assert learner.finished
+    assert learner.ask() == []
+    assert contents(copy) == before
+
+
+def test_undo_works_on_disk_across_iterations_and_the_same_answers_lead_to_the_same_run(copy, straight):
+    for undone in (1, 2, 3, 4):
+        learner = runs.resume(copy)
+        for _ in range(undone):
+            learner.undo()
+        assert json.loads((copy / "summary.json").read_text())["finished"] is False
+        assert runs.resume(copy).preferences.answers == 4 - undone
+        assert fingerprint(learner.run(ReturnExpert())) == straight
+        assert fingerprint(bayespbrl.load(copy).learner) == straight
+
+
+def test_what_was_undone_does_not_hinder_reading_what_came_after(copy):
+    # Two undone answers, and the run stopped where the second iteration's file holds trajectories alone again.
+    learner = runs.resume(copy)
+    for _ in range(3):
+        learner.undo()
+    learner.tell(["tie"])
+    assert learner.state.iteration == 1
+    again = bayespbrl.load(copy)
+    assert fingerprint(again.learner) == fingerprint(learner)
+    assert len(again.trajectories) == 20
+    assert [e["event"] for e in events(copy)].count("undone") == 3  # the log forgets nothing
+
+
+def test_a_last_line_that_was_cut_off_is_recovered(copy, straight):
+    whole = (copy / "events.jsonl").read_bytes()
+    for cut in (1, 30, 400, 1400):
+        (copy / "events.jsonl").write_bytes(whole[:-cut])
+        before = contents(copy)
+        assert bayespbrl.load(copy).preferences.answers <= 4
+        assert contents(copy) == before
+        learner = runs.resume(copy)
+        assert (copy / "events.jsonl").read_bytes()[-1:] == b"\n"
+        assert fingerprint(learner.run(ReturnExpert())) == straight
+        assert (copy / "events.jsonl").read_bytes().count(b"\n") == whole.count(b"\n")
+
+
+@pytest.mark.slow
+def test_a_run_killed_between_any_two_writes_goes_on_as_if_it_had_not_been(tmp_path, monkeypatch, straight):
+    """Copies the directory at each sync and around each renaming, and goes on from every copy."""
+    directory, copies = tmp_path / "run", []
+    fsync, replace = os.fsync, Path.replace
+
+    def snapshot():
+        if directory.exists():
+            copies.append(Path(shutil.copytree(directory, tmp_path / f"copy {len(copies)}")))
+
+    def syncing(descriptor):
+        snapshot()
+        fsync(descriptor)
+
+    def replacing(path, target):
+        snapshot()
+        result = replace(path, target)
+        snapshot()
+        return result
+
+    learner = start(directory)
+    monkeypatch.setattr(os, "fsync", syncing)
+    monkeypatch.setattr(Path, "replace", replacing)
+    learner.run(ReturnExpert())
+    monkeypatch.undo()
+    assert len(copies) > 40
+    for path in copies:
+        log = path / "events.jsonl"
+        kept = log.read_text() if log.exists() else ""
+        assert fingerprint(runs.resume(path).run(ReturnExpert())) == straight
+        assert log.read_text().startswith(kept)
+        summary = json.loads((path / "summary.json").read_text())
+        assert (summary["finished"], len(summary["iterations"])) == (True, 3)
+        assert {file.name for file in path.iterdir()} <= FILES | {"summary.json.part"}
+        shutil.rmtree(path)
+
+
+def test_a_summary_that_a_killed_process_left_old_is_brought_up_to_date(copy):
+    old = json.loads((copy / "summary.json").read_text())
+    old["iterations"].pop()
+    (copy / "summary.json").write_text(json.dumps(old | {"finished": False}))
+    runs.resume(copy)
+    new = json.loads((copy / "summary.json").read_text())
+    assert (new["finished"], len(new["iterations"])) == (True, 3)
+
+
+@pytest.mark.parametrize("fails", ["fsync", "interrupt", "summary"])
+def test_an_event_that_could_not_be_kept_is_taken_back_and_can_be_tried_again(tmp_path, monkeypatch, straight, fails):
+    directory = tmp_path / "run"
+    learner = start(directory)
+    (query,) = learner.ask()
+    learner.tell([ReturnExpert()(*query.trajectories)])
+    (query,) = learner.ask()
+    answer = ReturnExpert()(*query.trajectories)
+    before = (directory / "events.jsonl").read_bytes()
+    error = KeyboardInterrupt if fails == "interrupt" else OSError
+
+    def fail(*arguments):
+        raise error("stopped")
+
+    if fails == "summary":
+        monkeypatch.setattr(runs, "_write", fail)
+    else:
+        monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(error, match="stopped"):
+        learner.tell([answer])
+    monkeypatch.undo()
+    kept = (directory / "events.jsonl").read_bytes()
+    assert kept.startswith(before)
+    assert kept.count(b"\n") == before.count(b"\n") + (fails == "summary")  # there the answer was kept
+    assert fingerprint(runs.load(directory).learner) == fingerprint(learner)
+    assert fingerprint(learner.run(ReturnExpert())) == straight
+    assert fingerprint(bayespbrl.load(directory).learner) == straight
+
+
+SETTINGS = {
+    "missing": None,
+    "empty": "",
+    "no JSON": "{format: 1}",
+    "foreign": '{"name": "package", "version": "1.0"}',
+    "a list": "[1, 2]",
+    "bad value": '{"format": 1, "env": "gridworld", "kl_bound": -1}',
+    "no environment": '{"format": 1}',
+    "not text": b"\xff\xfe\x00\x01",
+}
+
+
+@pytest.mark.parametrize("content", SETTINGS.values(), ids=SETTINGS)
+def test_a_directory_without_the_settings_of_a_run_is_refused(copy, content):
+    file = copy / "settings.json"
+    if content is None:
+        file.unlink()
+    else:
+        file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    before = contents(copy)
+    for read in (bayespbrl.load, runs.resume):
+        with pytest.raises(ValueError, match=r"settings\.json") as refusal:
+            read(copy)
+        assert "\n" not in str(refusal.value)
+    assert contents(copy) == before
+
+
+def test_a_newer_format_is_refused_by_name(copy):
+    settings = json.loads((copy / "settings.json").read_text())
+    (copy / "settings.json").write_text(json.dumps(settings | {"format": 2}))
+    with pytest.raises(ValueError, match=r"settings\.json: expected format 1 or older, got 2 of a newer version"):
+        bayespbrl.load(copy)
+
+
+def test_a_directory_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="nowhere: expected a run directory"):
+        bayespbrl.load(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="expected a run directory"):
+        RunDirectory.open(tmp_path)
+
+
+def netcdf_of_another(file):
+    xr.Dataset({"temperature": ("time", np.arange(3.0))}).to_netcdf(file, engine="h5netcdf")
+
+
+DAMAGE = {
+    "missing": lambda file: file.unlink(),
+    "empty": lambda file: file.write_bytes(b""),
+    "cut in half": lambda file: file.write_bytes(file.read_bytes()[: file.stat().st_size // 2]),
+    "cut at the end": lambda file: file.write_bytes(file.read_bytes()[:-200]),
+    "text": lambda file: file.write_text("hello"),
+    "of another program": netcdf_of_another,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_a_damaged_or_foreign_file_of_an_iteration_is_named(copy, damage):
+    damage(copy / "iterations" / "0002.nc")
+    before = contents(copy)
+    for read in (bayespbrl.load, runs.resume):
+        with pytest.raises(
+            ValueError, match=r"copy: 0002\.nc: expected the netCDF file of an iteration, got "
+        ) as refusal:
+            read(copy)
+        assert "\n" not in str(refusal.value)
+    assert contents(copy) == before
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["hello", "[1]", "{}", '{"event": "collected"}', '{"event": "answered", "query": 1}', '{"event": "burnt"}', "3"],
+)
+def test_a_foreign_line_in_the_log_is_refused(copy, line):
+    log = copy / "events.jsonl"
+    lines = log.read_text().splitlines()
+    lines[2] = line
+    log.write_text("\n".join(lines) + "\n")
+    before = contents(copy)
+    for read in (bayespbrl.load, runs.resume):
+        with pytest.raises(ValueError, match=r"copy: (events\.jsonl, line 3: expected an event|.*expected)"):
+            read(copy)
+    assert contents(copy) == before
+
+
+def rows(states):
+    return np.eye(25)[states][:, ::2]
+
+
+@pytest.mark.parametrize("utility", ["linear-program", "known-reward"])
+@pytest.mark.parametrize("answers", [0, 1, 2, 4])
+def test_a_run_with_features_of_the_users_own_wants_them_again(tmp_path, answers, utility):
+    changes = {"features": rows, "utility": utility}
+    directory = tmp_path / "run"
+    learner = start(directory, **changes)
+    for _ in range(answers):
+        learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    for read in (bayespbrl.load, runs.resume):
+        with pytest.raises(
+            ValueError, match=r"run: a run with features of the user's own: expected it again as features="
+        ):
+            read(directory)
+    run = runs.resume(directory, features=rows).run(ReturnExpert())
+    whole = Learner("gridworld", **(QUICK | changes)).run(ReturnExpert())
+    if utility == "linear-program":
+        assert fingerprint(run) == fingerprint(whole)
+    np.testing.assert_array_equal(run.policy.table, whole.policy.table)
+
+
+def test_features_for_a_run_that_has_none_are_refused(finished):
+    with pytest.raises(ValueError, match=r"without features of the user's own: expected no features="):
+        bayespbrl.load(finished, features=rows)
+
+
+def test_a_run_with_a_policy_of_the_users_own_wants_one_again(tmp_path):
+    policy = TabularPolicy(np.random.default_rng(0).dirichlet(np.ones(5), 25))
+    directory = tmp_path / "run"
+    learner = start(directory, policy=policy)
+    learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    with pytest.raises(ValueError, match=r"run: a run with policy of the user's own: expected it again as policy="):
+        bayespbrl.load(directory)
+    run = runs.resume(directory, policy=policy).run(ReturnExpert())
+    assert fingerprint(run) == fingerprint(Learner("gridworld", policy=policy, **QUICK).run(ReturnExpert()))
+    assert fingerprint(bayespbrl.load(directory, policy=policy).learner) == fingerprint(run)
+
+
+class Corridor(gymnasium.Env):
+    """Discrete positions; ends at either end, so that trajectories differ in length."""
+
+    observation_space = gymnasium.spaces.Discrete(7)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.position = 3
+        return self.position, {}
+
+    def step(self, action):
+        self.position += 1 if action == (self.np_random.random() < 0.8) else -1
+        return self.position, float(self.position), self.position in (0, 6), False, {}
+
+
+def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_come_back(tmp_path):
+    options = {"utility": "linear-program", "iterations": 2, "max_steps": 12, "evaluation_episodes": 2}
+    directory = tmp_path / "run"
+    learner = bayespbrl.start(Corridor(), directory, **options).run(ReturnExpert())
+    assert len({len(trajectory) for trajectory in learner.trajectories}) > 1
+    assert any(trajectory.terminated for trajectory in learner.trajectories)
+    with pytest.raises(ValueError, match="Corridor"):
+        bayespbrl.load(directory)
+    run = bayespbrl.load(directory, env=Corridor())
+    assert fingerprint(run.learner) == fingerprint(learner)
+    assert run.policy.act(3) in (0, 1)
+    stopped = bayespbrl.start(Corridor(), tmp_path / "stopped", **options)
+    stopped.tell([ReturnExpert()(*stopped.ask()[0].trajectories)])
+    resumed = runs.resume(tmp_path / "stopped", env=Corridor()).run(ReturnExpert())
+    assert fingerprint(resumed) == fingerprint(learner)
+
+
+@pytest.mark.parametrize("policy", ["linear-gaussian", pytest.param("gaussian-process", marks=pytest.mark.slow)])
+def test_a_run_with_continuous_actions_comes_back_and_goes_on_bit_for_bit(tmp_path, policy):
+    options = {"utility": "linear-program", "iterations": 2, "evaluation_episodes": 2, "centres": 20, "max_steps": 15}
+    whole = bayespbrl.start("swing-up", tmp_path / "whole", policy=policy, **options).run(ReturnExpert())
+    stopped = bayespbrl.start("swing-up", tmp_path / "stopped", policy=policy, **options)
+    for _ in range(2):
+        stopped.tell([ReturnExpert()(*stopped.ask()[0].trajectories)])
+    resumed = runs.resume(tmp_path / "stopped").run(ReturnExpert())
+    assert fingerprint(resumed) == fingerprint(whole) == fingerprint(bayespbrl.load(tmp_path / "whole").learner)
+    run = bayespbrl.load(tmp_path / "whole")
+    space = run.learner.environment.action_space
+    for observation in run.trajectories[0].states[:5]:
+        action = run.policy.act(observation)
+        assert space.contains(action)
+    key = jax.random.key(0)
+    np.testing.assert_array_equal(run.policy.act(observation, key=key), run.policy.act(observation, key=key))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("utility", ["posterior-mean", "most-likely"])
+def test_a_posterior_comes_back_and_the_run_goes_on_bit_for_bit(tmp_path, utility):
+    changes = {"utility": utility}
+    whole = start(tmp_path / "whole", **changes).run(ReturnExpert())
+    directory = tmp_path / "stopped"
+    for _ in range(4):
+        learner = runs.resume(directory) if directory.exists() else start(directory, **changes)
+        learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    assert fingerprint(runs.resume(directory)) == fingerprint(whole)
+    run = bayespbrl.load(tmp_path / "whole")
+    assert {"posterior", "log_likelihood", "observed_data", "constant_data"} <= set(run.posterior.children)
+    given, back = whole.estimate.posterior, run.posterior
+    for name in ("margins", "coordinates", "utility_weights"):
+        np.testing.assert_array_equal(back["posterior"][name].values, given["posterior"][name].values)
+    assert dict(back.attrs) == dict(given.attrs)
+    ones = np.eye(25)
+    np.testing.assert_array_equal(run.estimate.draws(ones), whole.estimate.draws(ones))
+
+
+@pytest.mark.slow
+def test_a_run_without_any_pair_comes_back_with_its_posterior(tmp_path):
+    learner = start(tmp_path / "run", utility="posterior-mean", iterations=1).run(lambda first, second: "tie")
+    run = bayespbrl.load(tmp_path / "run")
+    assert fingerprint(run.learner) == fingerprint(learner)
+    np.testing.assert_array_equal(run.estimate.weights, np.zeros(25))
+
+
+VICTIM = """
+import json, sys
+from bayespbrl import ReturnExpert, runs
+
+directory, settings = sys.argv[1], json.loads(sys.argv[2])
+try:
+    learner = runs.resume(directory)
+except ValueError:
+    learner = runs.start("gridworld", directory, **settings)
+print("ready", flush=True)
+
+def expert(first, second):
+    print("asked", flush=True)
+    return ReturnExpert()(first, second)
+
+learner.run(expert)
+print("done", flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_a_process_killed_at_any_moment_loses_no_answer(tmp_path):
+    settings = QUICK | {"iterations": 12}
+    directory, random = tmp_path / "run", np.random.default_rng()
+    asked, kills, done = 0, 0, False
+    while not done:
+        command = [sys.executable, "-c", VICTIM, str(directory), json.dumps(settings)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as victim:
+            assert victim.stdout.readline() == "ready\n"
+            if kills < 5:
+                time.sleep(random.uniform(0.0, 2.5))
+                victim.send_signal(signal.SIGKILL)
+                kills += 1
+            lines = victim.stdout.read().split()
+        asked += lines.count("asked")
+        done = "done" in lines
+        kept = (directory / "events.jsonl").read_text() if (directory / "events.jsonl").exists() else ""
+        kept = kept[: kept.rfind("\n") + 1]
+        assert kept.count('"answered"') >= asked - kills  # at most the answer on its way when the process was killed
+        if not done:
+            runs.load(directory)
+    assert kept.count('"answered"') == 13
+    assert 13 <= asked <= 13 + kills
+    whole = Learner("gridworld", **settings).run(ReturnExpert())
+    assert fingerprint(bayespbrl.load(directory).learner) == fingerprint(whole)
