@@ -553,7 +553,7 @@ def test_a_posterior_comes_back_and_the_run_goes_on_bit_for_bit(tmp_path, utilit
     given, back = whole.estimate.posterior, run.posterior
     for name in ("margins", "coordinates", "utility_weights"):
         np.testing.assert_array_equal(back["posterior"][name].values, given["posterior"][name].values)
-    assert dict(back.attrs) == dict(given.attrs)
+    np.testing.assert_equal(dict(back.attrs), dict(given.attrs))  # NaN equals NaN
     ones = np.eye(25)
     np.testing.assert_array_equal(run.estimate.draws(ones), whole.estimate.draws(ones))
 
