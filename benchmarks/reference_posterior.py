@@ -2,8 +2,8 @@
 
     python benchmarks/reference_posterior.py --differences differences.npy [--steepness 5] [--prior-scale 1]
 
-Particles from the prior pass through likelihood powers 0 → 1 chosen so that half of them survive each resampling, and
-are moved by random-walk Metropolis steps with the particles' own covariance. Independent runs give the Monte Carlo error.
+Particles from the prior pass through likelihood powers 0 → 1, chosen so that half of them survive each resampling,
+and are moved by random-walk steps with the particles' own covariance. Independent runs give the Monte Carlo error.
 Prints one JSON line: how many of its errors the posterior means of the margins by `sample_posterior` are away from it,
 and both log evidences. Nothing of the sampler under test is used: no ellipse, no factorisation, no expectation
 propagation; the particles live in the row space by QR.

@@ -2,6 +2,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from numpyro.infer import MCMC
 from scipy import stats
 from scipy.special import logsumexp
 
@@ -186,6 +187,25 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
         inside = stats.multivariate_normal(problem.centre, problem.root @ problem.root.T).logpdf(z)
         np.testing.assert_allclose(np.diff(residual), np.diff(joint - inside), rtol=1e-9)
         np.testing.assert_allclose(prior.residual(jax.vmap(prior.lift)(z)), likelihood, rtol=1e-9)
+
+
+def test_numpyros_mcmc_gives_the_same_draws_as_the_compiled_loop():
+    fit = fit_gaussian(consistent(6, 9), prior_scale=1.0, likelihood=Mixed(5.0, 6.0))
+    with jax.enable_x64(True):
+        chains = posterior._Chains.start(fit, num_chains=2, chunk=5, seed=0)
+        mcmc = MCMC(
+            posterior.KERNEL,
+            num_warmup=0,
+            num_samples=5,
+            num_chains=2,
+            chain_method="vectorized",
+            progress_bar=False,
+        )
+        mcmc.post_warmup_state = chains.state
+        mcmc.run(chains.state.rng_key, chains.problem)
+        z = mcmc.get_samples(group_by_chain=True)
+        margins = chains.extended(5).collected("coordinates", 5) @ fit.factors.loadings.T
+        np.testing.assert_allclose(z["margins"][:, :, :6], margins, rtol=0, atol=1e-9)
 
 
 def test_chains_started_in_the_far_tail_forget_it():

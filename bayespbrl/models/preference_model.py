@@ -71,7 +71,7 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
     """Ellipses of N(m, AAᵀ); v = (L(z − m), z − m, A⁻¹(z − m)), so that a candidate costs O(K + r)."""
     loadings, centre = problem.loadings, problem.centre
     number, rank = loadings.shape
-    map_noise = jnp.concatenate([loadings @ problem.root, problem.root, jnp.eye(rank)])
+    map_noise = jnp.concatenate([loadings @ problem.root, problem.root])
     margins_at_centre = loadings @ centre
 
     def lift(z):
@@ -83,9 +83,13 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
         prior = jnp.sum((centre + displacements) ** 2, axis=-1) / problem.prior_scale**2
         return log_likelihood + 0.5 * (jnp.sum(whitened**2, axis=-1) - prior)
 
+    def noise(key, moves):
+        whitened = random.normal(key, (moves, rank), dtype=loadings.dtype)
+        return jnp.concatenate([whitened @ map_noise.T, whitened], axis=1)
+
     return Ellipse(
         lift,
-        lambda key, moves: random.normal(key, (moves, rank), dtype=loadings.dtype) @ map_noise.T,
+        noise,
         residual,
         lambda v: centre + v[number : number + rank],
     )
@@ -111,7 +115,9 @@ def padded_problem(
     mean: np.ndarray,
     covariance: np.ndarray,
 ) -> PreferenceProblem:
-    """Pad a problem with K answers and rank r to the next power of two, at least 8; padded coordinates keep the prior.
+    """Pad K answers and rank r to a capacity: a power of two, at least 8, or three quarters of one above 64.
+
+    Padded coordinates keep the prior.
 
     Args:
       loadings: L, shape (K, r); rows of exactly zero are not used.
@@ -121,6 +127,8 @@ def padded_problem(
     """
     number, rank = loadings.shape
     capacity = max(8, 1 << (max(number, 1) - 1).bit_length())
+    # above 64 the padding costs more than the compilation that a step between two powers saves
+    capacity = 3 * capacity // 4 if capacity > 64 and number <= 3 * capacity // 4 else capacity
     padded, used = np.zeros((capacity, capacity)), np.zeros(capacity, dtype=bool)
     padded[:number, :rank] = loadings
     used[:number] = np.any(loadings != 0, axis=1)
