@@ -1,0 +1,99 @@
+"""Whether a posterior's chains agree: R̂, effective sample sizes and Monte Carlo errors of the margins (step 1)."""
+
+import numpy as np
+import xarray as xr
+from arviz_stats.base import array_stats
+from matplotlib.axes import Axes
+
+from bayespbrl.diagnostics.convergence import convergence as convergence_of_draws
+
+
+def convergence(tree: xr.DataTree, *, rhat_max: float = 1.01, effective_sample_size_min: float = 400.0) -> xr.Dataset:
+    """What the draws of each margin are worth.
+
+    Args:
+      tree: what `sample_posterior` returned.
+      rhat_max, effective_sample_size_min: what every margin has to meet.
+
+    Returns:
+      rhat, effective_sample_size (bulk), effective_sample_size_tail, monte_carlo_error (of the mean), converged, each
+      (preference), with the attributes rhat_max, effective_sample_size_min, converged (0 or 1) and both limits.
+
+    Source: Vehtari et al. (2021).
+    """
+    margins = np.asarray(tree["posterior"]["margins"])
+    report = convergence_of_draws(margins)
+    tail = np.full(margins.shape[2], float(margins.shape[0] * margins.shape[1]))
+    varies = ~np.all(margins == margins[:1, :1], axis=(0, 1))
+    if varies.any():
+        tail[varies] = array_stats.ess(
+            margins[:, :, varies], method="tail", prob=(0.05, 0.95), chain_axis=0, draw_axis=1
+        )
+    each = (report.rhat <= rhat_max) & (report.effective_sample_size >= effective_sample_size_min)
+    return xr.Dataset(
+        {
+            "rhat": ("preference", report.rhat),
+            "effective_sample_size": ("preference", report.effective_sample_size),
+            "effective_sample_size_tail": ("preference", tail),
+            "monte_carlo_error": ("preference", report.monte_carlo_error),
+            "converged": ("preference", each),
+        },
+        attrs={
+            "rhat_max": report.rhat_max,
+            "effective_sample_size_min": report.effective_sample_size_min,
+            "converged": int(each.all()),
+            "rhat_limit": rhat_max,
+            "effective_sample_size_limit": effective_sample_size_min,
+        },
+    )
+
+
+def plot_convergence(result: xr.Dataset, axes: Axes) -> Axes:
+    """Effective sample size of each margin; those that have not converged carry their R̂."""
+    numbers = np.arange(result.sizes["preference"])
+    axes.plot(numbers, result["effective_sample_size"], "o", markersize=3, label="bulk")
+    axes.plot(numbers, result["effective_sample_size_tail"], "x", markersize=4, label="tail")
+    limit = result.attrs["effective_sample_size_limit"]
+    axes.axhline(limit, color="0.5", linestyle="--", linewidth=1, label=f"limit {limit:g}")
+    for k in numbers[~result["converged"].values]:
+        place = (k, float(result["effective_sample_size"][k]))
+        axes.annotate(f"R̂ {float(result['rhat'][k]):.2f}", place, xytext=(3, 3), textcoords="offset points", fontsize=7)
+    verdict = "converged" if result.attrs["converged"] else "not converged"
+    axes.set(
+        xlabel="preference",
+        ylabel="effective sample size",
+        ylim=(0, None),
+        title=f"{verdict}, largest R̂ {result.attrs['rhat_max']:.3f}",
+    )
+    axes.legend()
+    return axes
+
+
+def plot_ranks(tree: xr.DataTree, axes: Axes, *, preference: int | None = None, bins: int = 20) -> Axes:
+    """Ranks of each chain's draws among all of them, as one line a chain: level where the chains agree.
+
+    Args:
+      tree: what `sample_posterior` returned.
+      axes: to draw on.
+      preference: whose margin; that of largest R̂ by default.
+      bins: of the ranks.
+
+    Raises:
+      ValueError: a preference that there is not.
+
+    Source: Vehtari et al. (2021), section 4.2.
+    """
+    margins = np.asarray(tree["posterior"]["margins"])
+    if preference is None and margins.shape[2]:
+        preference = int(np.argmax(convergence_of_draws(margins).rhat))
+    if preference is None or not 0 <= preference < margins.shape[2]:
+        raise ValueError(f"preference: expected a number in 0 … {margins.shape[2] - 1}, got {preference}")
+    draws = margins[:, :, preference]
+    ranks = np.argsort(np.argsort(draws, axis=None)).reshape(draws.shape)
+    for chain, row in enumerate(ranks):
+        counts, edges = np.histogram(row, bins=bins, range=(0, draws.size))
+        axes.stairs(counts * bins / row.size, edges, label=f"chain {chain}")
+    axes.axhline(1.0, color="0.5", linestyle="--", linewidth=1)
+    axes.set(xlabel="rank", ylabel="relative frequency", ylim=(0, None), title=f"Ranks of margin {preference}")
+    axes.legend(fontsize=7)
+    return axes

@@ -1,0 +1,98 @@
+"""Which answer carries the posterior: what changes when it is left out, by importance weights and by exact refits.
+
+Pareto-smoothed weights estimate each change from the draws that there are; k̂ says how far they can be trusted (not
+above 0.7, which is common where a likelihood has a jump), and is itself a measure of influence. The refits are exact.
+"""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from arviz_stats.base import array_stats
+from matplotlib.axes import Axes
+
+from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_probabilities, refit, tied_rows
+
+PARETO_K_LIMIT = 0.7
+
+
+def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: Any) -> xr.Dataset:
+    """Change of the posterior when each of the K answers is left out.
+
+    Args:
+      tree: what `sample_posterior` returned.
+      refits: how many answers are left out by an exact refit, those with k̂ above 0.7 first, and among
+        equals those whose estimated change is largest; None for all.
+      sampling_options: `num_samples` and the like of the refits; eq. 8 keeps the full K.
+
+    Returns:
+      along `preference`: `pareto_k`; `shift_estimated`, the length of the change of the mean utility weights over the
+      prior scale, by importance weights; where `refitted`, and NaN elsewhere: `shift`, the same by the refit,
+      `probability` of the answer given the others, and `margin_means` (preference, margin), the means of all margins
+      without the answer; `converged`, whether the refit did. Beside them `margin_mean` (margin), the means with all.
+
+    Raises:
+      ValueError: refits < 0.
+    """
+    number = tree["constant_data"].sizes["preference"]
+    if refits is not None and refits < 0:
+        raise ValueError(f"refits: expected a number >= 0 or None, got {refits}")
+    differences = np.asarray(tree["constant_data"]["differences"])
+    weights = np.asarray(tree["utility_weights_mean"])
+    scale = float(tree.attrs["prior_scale"])
+    pareto_k, estimated = _estimates(tree)
+    # an estimate whose weights cannot be trusted may be far too small
+    order = np.lexsort((-estimated, pareto_k <= PARETO_K_LIMIT))
+    chosen = order[:refits]
+    shift, probability = np.full(number, np.nan), np.full(number, np.nan)
+    means, converged = np.full((number, number), np.nan), np.zeros(number, dtype=bool)
+    outcome = np.where(tied_rows(tree), TIED, PREFERRED)
+    for k in chosen:
+        others = refit(tree, np.arange(number) != k, **sampling_options)
+        change = weights - np.asarray(others["utility_weights_mean"])
+        shift[k] = np.linalg.norm(change) / scale
+        probability[k] = answer_probabilities(others, differences[[k]])[0, outcome[k]]
+        means[k] = differences @ np.asarray(others["utility_weights_mean"])
+        converged[k] = bool(others.attrs["converged"])
+    return xr.Dataset(
+        {
+            "pareto_k": ("preference", pareto_k),
+            "shift_estimated": ("preference", estimated / scale),
+            "refitted": ("preference", np.isin(np.arange(number), chosen)),
+            "shift": ("preference", shift),
+            "probability": ("preference", probability),
+            "converged": ("preference", converged),
+            "margin_means": (("preference", "margin"), means),
+            "margin_mean": ("margin", differences @ weights),
+        }
+    )
+
+
+def plot_influence(result: xr.Dataset, axes: Axes) -> Axes:
+    """Change of the mean utility weights by each answer, exact where it was refitted; k̂ where above its limit."""
+    numbers = np.arange(result.sizes["preference"])
+    axes.plot(numbers, result["shift_estimated"], "o", markersize=4, fillstyle="none", label="by importance weights")
+    axes.plot(numbers, result["shift"], "o", markersize=4, label="by exact refit")
+    highest = np.fmax(result["shift_estimated"].values, result["shift"].values)
+    for k in numbers[result["pareto_k"].values > PARETO_K_LIMIT]:
+        text = f"k̂ {float(result['pareto_k'][k]):.1f}"
+        axes.annotate(text, (k, highest[k]), xytext=(3, 3), textcoords="offset points", fontsize=7)
+    axes.set(xlabel="answer left out", ylabel="shift of mean weights / σ", ylim=(0, None), title="Influence")
+    axes.legend()
+    return axes
+
+
+def _estimates(tree: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
+    """k̂ and the length of the change of the mean weights, each shape (K,)."""
+    z = np.asarray(tree["posterior"]["coordinates"])
+    log_likelihood = np.asarray(tree["log_likelihood"]["answers"])
+    draws = z.reshape(z.shape[0] * z.shape[1], z.shape[2])
+    pareto_k, change = np.zeros(log_likelihood.shape[2]), np.zeros(log_likelihood.shape[2])
+    for k, column in enumerate(np.moveaxis(log_likelihood, 2, 0)):
+        if np.ptp(column) == 0:  # a row of zeros: all weights are equal
+            continue
+        relative = min(1.0, float(array_stats.ess(column[..., None], chain_axis=0, draw_axis=1)[0]) / column.size)
+        log_weights, pareto_k[k] = array_stats.psislw(column.ravel(), r_eff=relative)
+        weights = np.exp(log_weights - np.max(log_weights))
+        change[k] = np.linalg.norm(weights @ draws / weights.sum() - draws.mean(axis=0))
+    return pareto_k, change

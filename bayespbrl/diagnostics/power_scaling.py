@@ -1,0 +1,99 @@
+"""How much the posterior of a utility leans on the prior scale σ and on the answers: power-scaling sensitivity.
+
+The prior N(0, σ²I) to the power α is, normalised, N(0, σ²I/α): scaling its power is changing σ to σ/√α. The likelihood
+to the power α counts every answer α times.
+"""
+
+import numpy as np
+import xarray as xr
+from arviz_stats import psense
+from matplotlib.axes import Axes
+
+from bayespbrl.diagnostics.predictions import checked_differences
+from bayespbrl.models.low_rank import low_rank
+
+COMPONENTS = ("prior", "likelihood")
+
+
+def sensitivity(
+    tree: xr.DataTree, features: np.ndarray | None = None, *, threshold: float = 0.05, seed: int = 0
+) -> xr.Dataset:
+    """Power-scaling sensitivity of the margins, or of the utility at given features, to σ and to the likelihood.
+
+    Args:
+      tree: what `sample_posterior` returned.
+      features: of states φ(s) or feature sums ψ(τ) whose utility is asked about, shape (n, D), in the units of the
+        differences. None: the K margins.
+      threshold: above it a quantity counts as sensitive.
+      seed: of the prior draws of what the answers do not see.
+
+    Returns:
+      `sensitivity` (component, quantity) with components "prior" and "likelihood" (0 for a quantity that is the same in
+      every draw, or where there are no answers); `diagnosis` (quantity), by which of the two reach the threshold:
+      "both" (prior and answers disagree, or the answers only bound what the prior spreads), "prior", "likelihood" or
+      "neither"; and the attribute `threshold`.
+
+    Raises:
+      ValueError: features of another shape or not finite.
+
+    Source: Kallioinen et al. (2024), by `arviz_stats.psense`.
+    """
+    draws, log_prior = _quantities(tree, features, seed=seed)
+    labels = {"chain": np.arange(draws.shape[0]), "draw": np.arange(draws.shape[1])}
+    varies = ~np.all(draws == draws[:1, :1], axis=(0, 1))
+    log_likelihood = np.asarray(tree["log_likelihood"]["answers"]).sum(axis=2)
+    sensitivities = np.zeros((2, draws.shape[2]))
+    groups = {"posterior": (("chain", "draw", "quantity"), draws[:, :, varies])}
+    for row, (name, log_density) in enumerate(zip(COMPONENTS, (log_prior, log_likelihood), strict=True)):
+        # nothing to weigh the draws by: ArviZ's tail estimates would fail
+        if not varies.any() or np.ptp(log_density) == 0:
+            continue
+        group = {f"log_{name}": (("chain", "draw"), log_density)}
+        parts = {key: xr.Dataset({"utility": value}, labels) for key, value in {**groups, **group}.items()}
+        sensitivities[row, varies] = psense(xr.DataTree.from_dict(parts), group=name)["utility"].values
+    return xr.Dataset(
+        {
+            "sensitivity": (("component", "quantity"), sensitivities),
+            "diagnosis": ("quantity", _diagnosis(sensitivities >= threshold)),
+        },
+        coords={"component": list(COMPONENTS)},
+        attrs={"threshold": threshold},
+    )
+
+
+def plot_sensitivity(result: xr.Dataset, axes: Axes) -> Axes:
+    """Sensitivity to the prior scale and to the likelihood, as two bars for each quantity."""
+    numbers = np.arange(result.sizes["quantity"])
+    labels = {"prior": "prior scale", "likelihood": "likelihood"}
+    for component, offset in zip(COMPONENTS, (-0.2, 0.2), strict=True):
+        axes.bar(numbers + offset, result["sensitivity"].sel(component=component), 0.4, label=labels[component])
+    axes.axhline(result.attrs["threshold"], color="0.5", linestyle="--", linewidth=1)
+    axes.set(xlabel="quantity", ylabel="power-scaling sensitivity", title="Sensitivity")
+    axes.legend()
+    return axes
+
+
+def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draws (chain, draw, n) and the log prior of all that they depend on (chain, draw), up to a constant."""
+    z = np.asarray(tree["posterior"]["coordinates"])
+    scale = float(tree.attrs["prior_scale"])
+    log_prior = -np.sum(z**2, axis=2) / (2 * scale**2)
+    if features is None:
+        return np.asarray(tree["posterior"]["margins"]), log_prior
+    known = np.asarray(tree["constant_data"]["differences"])
+    features = checked_differences(features, name="features", length=known.shape[1])
+    basis = low_rank(known).basis
+    inside = features @ basis
+    # of the directions that no answer has seen, only those in which the features lie: all D would swamp the weights
+    rest = features - inside @ basis.T
+    rounding = np.linalg.norm(rest, axis=1) <= 1e-9 * np.linalg.norm(features, axis=1)
+    outside = low_rank(np.where(rounding[:, None], 0.0, rest))
+    unseen = scale * np.random.default_rng(seed).standard_normal((*z.shape[:2], outside.loadings.shape[1]))
+    log_prior = log_prior - np.sum(unseen**2, axis=2) / (2 * scale**2)
+    return z @ inside.T + unseen @ outside.loadings.T, log_prior
+
+
+def _diagnosis(sensitive: np.ndarray) -> np.ndarray:
+    names = np.array([["neither", "likelihood"], ["prior", "both"]])
+    prior, likelihood = sensitive.astype(int)
+    return names[prior, likelihood]

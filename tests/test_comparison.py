@@ -1,0 +1,140 @@
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.special import expit
+
+import bayespbrl.models as models
+from bayespbrl.diagnostics import compare_likelihoods, plot_comparison
+from bayespbrl.models import sample_posterior
+
+SAMPLING = {"num_warmup": 250, "num_samples": 500, "max_samples": 500}
+# one pair asked about five times; one answer contradicts the others
+ROWS = np.array([[0.5], [0.5], [-0.5], [0.5], [0.5]])
+CANDIDATES = {
+    "sure": {"likelihood": "logistic", "steepness": 60.0},
+    "fitting": {"likelihood": "logistic", "steepness": 2.0},
+    "eq. 8": {"likelihood": "mixed", "steepness": 5.0},
+}
+
+
+def left_out(rows, likelihood):
+    """log p(answer | all others) by quadrature over w, no point at a jump."""
+    w = np.linspace(-9.003, 9.001, 20001)
+    p = likelihood(rows * w)
+    prior = np.exp(-(w**2) / 2)
+    without = [prior * np.delete(p, k, axis=0).prod(axis=0) for k in range(len(rows))]
+    return np.array([np.log(p[k] @ weights / weights.sum()) for k, weights in enumerate(without)])
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    return compare_likelihoods(ROWS, CANDIDATES, folds=5, **SAMPLING)
+
+
+def test_leaving_out_one_at_a_time_agrees_with_quadrature_and_eq_8_keeps_the_full_number_of_preferences(comparison):
+    likelihoods = {
+        "sure": lambda t: expit(60 * t),
+        "fitting": lambda t: expit(2 * t),
+        "eq. 8": lambda t: (4 * (t > 0) + expit(5 * t)) / 5,
+    }
+    for name, likelihood in likelihoods.items():
+        got = comparison["log_probability"].sel(candidate=name)
+        np.testing.assert_allclose(got, left_out(ROWS, likelihood), atol=0.15, rtol=0.05)
+
+
+def test_an_overconfident_likelihood_loses_and_the_best_comes_first(comparison):
+    elpd = comparison["elpd"]
+    assert comparison["candidate"].values[0] == "fitting"
+    assert np.all(np.diff(elpd) <= 0)
+    assert float(elpd.sel(candidate="sure")) < float(elpd.sel(candidate="fitting")) - 0.5
+    assert float(comparison["difference"][0]) == float(comparison["difference_error"][0]) == 0
+
+
+def test_standard_errors_are_those_of_a_sum_of_independent_terms(comparison):
+    values = comparison["log_probability"].values
+    np.testing.assert_allclose(comparison["elpd"], values.sum(axis=1))
+    np.testing.assert_allclose(comparison["standard_error"], np.sqrt(5) * values.std(axis=1, ddof=1))
+    behind = values[1] - values[0]
+    np.testing.assert_allclose(comparison["difference"][1], behind.sum())
+    np.testing.assert_allclose(comparison["difference_error"][1], np.sqrt(5) * behind.std(ddof=1))
+
+
+def test_folds_are_as_equal_as_they_can_be_and_the_same_for_all_candidates(monkeypatch):
+    asked = []
+
+    def listening(differences, **options):
+        asked.append((differences, options["number_of_preferences"]))
+        return sample_posterior(differences, **options)
+
+    monkeypatch.setattr(models, "sample_posterior", listening)
+    rows = np.arange(1.0, 6.0)[:, None]
+    result = compare_likelihoods(rows, {"a": {}, "b": {"steepness": 1.0}}, folds=2, seed=5, **SAMPLING)
+    assert sorted(np.bincount(result["fold"])) == [2, 3]
+    assert {number for _, number in asked} == {5}
+    for (first, _), (second, _) in zip(asked[:2], asked[2:], strict=True):
+        np.testing.assert_array_equal(first, second)
+    other = compare_likelihoods(rows, {"a": {}}, folds=2, seed=6, **SAMPLING)
+    assert not np.array_equal(other["fold"], result["fold"])
+
+
+def test_rows_of_one_answer_are_left_out_together():
+    groups = np.array([0, 0, 2, 3, 3])
+    fold = compare_likelihoods(ROWS, {"a": {"likelihood": "logistic"}}, folds=2, groups=groups, **SAMPLING)[
+        "fold"
+    ].values
+    assert all(len(set(fold[groups == group])) == 1 for group in groups)
+    assert set(fold) == {0, 1}
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_with_no_answer_or_one_the_prior_predicts(number):
+    result = compare_likelihoods(ROWS[:number], CANDIDATES, **SAMPLING)
+    assert dict(result.sizes) == {"candidate": 3, "preference": number}
+    np.testing.assert_allclose(result["elpd"], number * np.log(0.5))
+    assert np.all(np.isnan(result["standard_error"]))
+    axes = Figure().subplots()
+    assert plot_comparison(result, axes) is axes
+
+
+@pytest.mark.slow
+def test_answers_of_no_difference_are_predicted_as_such():
+    rows, tied = np.array([[0.6], [0.05], [0.5], [-0.04]]), np.array([False, True, False, True])
+    candidates = {
+        name: {"likelihood": "logistic", "steepness": 8.0, "tie_threshold": threshold}
+        for name, threshold in (("narrow", 0.001), ("wide", 0.2))
+    }
+    result = compare_likelihoods(rows, candidates, folds=4, indifferent=tied, **SAMPLING)
+    assert list(result["candidate"].values) == ["wide", "narrow"]
+    assert np.all(result["log_probability"].sel(candidate="narrow")[tied] < np.log(0.1))
+    assert np.all(result["log_probability"].sel(candidate="wide")[tied] > np.log(0.3))
+
+
+def test_the_figure_names_each_candidate_on_the_axes_given(comparison):
+    figure = Figure()
+    left, right = figure.subplots(1, 2)
+    assert plot_comparison(comparison, right) is right
+    FigureCanvasAgg(figure).draw()
+    assert not left.has_data()
+    assert [label.get_text().split(" (")[0] for label in right.get_yticklabels()] == list(
+        comparison["candidate"].values
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"differences": np.zeros(3)}, r"differences: expected shape \(n, D\), got \(3,\)"),
+        ({"differences": np.full((2, 1), np.nan)}, "differences: expected finite entries, got 2"),
+        ({"candidates": {}}, "candidates: expected at least one, got none"),
+        ({"folds": 1}, "folds: expected an integer >= 2, got 1"),
+        ({"folds": 2.0}, "folds: expected an integer >= 2, got 2.0"),
+        ({"indifferent": np.ones(3, dtype=bool)}, r"indifferent: expected bool of shape \(5,\)"),
+        ({"indifferent": np.ones(5, dtype=bool)}, "candidates: expected a tie_threshold .* got none in"),
+        ({"groups": np.arange(3)}, "groups: expected 5 integers"),
+        ({"candidates": {"a": {"likelihood": "flat"}}}, "likelihood: expected .* got .flat."),
+    ],
+)
+def test_arguments_out_of_range_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        compare_likelihoods(**{"differences": ROWS, "candidates": CANDIDATES, **arguments})

@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.special import expit
+
+import bayespbrl.models as models
+from bayespbrl.diagnostics import influence, plot_influence
+from bayespbrl.models import sample_posterior
+
+SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+# six answers that agree, and one, the fifth, that contradicts them
+CONTRADICTED = np.array([[0.5, 0.1], [0.4, 0.0], [0.6, -0.1], [0.5, 0.0], [-0.55, 0.05], [0.45, 0.1], [0.5, -0.05]])
+
+
+def test_the_answer_that_contradicts_the_others_is_the_most_influential_and_the_least_probable():
+    tree = sample_posterior(CONTRADICTED, likelihood="logistic", **SAMPLING)
+    every = influence(tree, refits=None, **SAMPLING)
+    assert bool(every["refitted"].all())
+    assert np.argmax(every["shift"].values) == np.argmax(every["shift_estimated"].values) == 4
+    assert np.argmin(every["probability"].values) == 4
+    assert float(every["probability"][4]) < 0.2
+    one = influence(tree, refits=1, **SAMPLING)
+    np.testing.assert_array_equal(np.flatnonzero(one["refitted"]), [4])
+    assert float(one["shift"][4]) == float(every["shift"][4])
+    # without it, the others' margins grow
+    means = one["margin_means"][4] - one["margin_mean"]
+    assert np.all(np.delete(means.values, 4) > 0)
+
+
+def test_without_an_answer_the_means_are_those_by_quadrature():
+    rows = np.array([[0.7], [-0.4], [0.9]])
+    tree = sample_posterior(rows, likelihood="logistic", prior_scale=1.5, **SAMPLING)
+    result = influence(tree, refits=None, **SAMPLING)
+    w = np.linspace(-12, 12, 4001)
+    p = expit(5 * rows * w)
+    prior = np.exp(-((w / 1.5) ** 2) / 2)
+
+    def mean(values, weights):
+        return values @ weights / weights.sum()
+
+    everything = mean(w, prior * p.prod(axis=0))
+    for k in range(3):
+        weights = prior * np.delete(p, k, axis=0).prod(axis=0)
+        assert float(result["shift"][k]) == pytest.approx(abs(everything - mean(w, weights)) / 1.5, abs=0.06)
+        assert float(result["probability"][k]) == pytest.approx(mean(p[k], weights), abs=0.03)
+        np.testing.assert_allclose(result["margin_means"][k], rows[:, 0] * mean(w, weights), atol=0.08)
+
+
+def test_importance_weights_and_refits_agree_where_k_hat_is_low():
+    tree = sample_posterior(CONTRADICTED[:4], likelihood="logistic", steepness=2.0, **SAMPLING)
+    result = influence(tree, refits=None, **SAMPLING)
+    assert np.all(result["pareto_k"] < 0.7)
+    np.testing.assert_allclose(result["shift_estimated"], result["shift"], atol=0.08)
+
+
+def test_an_answer_whose_weights_cannot_be_trusted_is_refitted_before_others():
+    # the step of eq. 8 throws away nearly all draws of one half: its weights are worth nothing
+    tree = sample_posterior(CONTRADICTED, steepness=40.0, **SAMPLING)
+    everything = influence(tree, refits=0)
+    high = everything["pareto_k"].values > 0.7
+    assert high.any()
+    assert not high.all()
+    some = influence(tree, refits=int(high.sum()), **SAMPLING)
+    np.testing.assert_array_equal(some["refitted"], high)
+
+
+def test_a_row_of_zeros_has_no_influence():
+    rows = np.vstack([CONTRADICTED[:2], np.zeros((1, 2))])
+    tree = sample_posterior(rows, **SAMPLING)
+    result = influence(tree, refits=None, **SAMPLING)
+    assert float(result["pareto_k"][2]) == float(result["shift_estimated"][2]) == 0
+    assert float(result["shift"][2]) < 0.06
+    assert float(result["probability"][2]) == 0.5
+
+
+def test_the_refits_of_eq_8_keep_the_full_number_of_preferences(monkeypatch):
+    asked = []
+
+    def listening(differences, **options):
+        asked.append((len(differences), options["number_of_preferences"], options["seed"], options["prior_scale"]))
+        return sample_posterior(differences, **options)
+
+    tree = sample_posterior(CONTRADICTED[:3], seed=7, prior_scale=0.8, **SAMPLING)
+    monkeypatch.setattr(models, "sample_posterior", listening)
+    influence(tree, refits=2, **SAMPLING)
+    assert asked == [(2, 3, 7, 0.8)] * 2
+
+
+def test_without_the_only_answer_the_prior_is_left():
+    tree = sample_posterior(CONTRADICTED[:1], **SAMPLING)
+    result = influence(tree, **SAMPLING)
+    mean = np.linalg.norm(tree["utility_weights_mean"])
+    assert float(result["shift"][0]) == pytest.approx(mean, rel=1e-12)
+    assert float(result["probability"][0]) == pytest.approx(0.5, abs=1e-12)
+    assert float(result["margin_means"][0, 0]) == 0
+
+
+def test_without_answers_there_is_none_to_leave_out():
+    result = influence(sample_posterior(np.zeros((0, 2)), **SAMPLING), refits=None)
+    assert result.sizes["preference"] == 0
+    axes = Figure().subplots()
+    assert plot_influence(result, axes) is axes
+
+
+def test_the_figure_shows_every_answer_and_the_k_hat_of_those_above_the_limit():
+    result = influence(sample_posterior(CONTRADICTED, steepness=40.0, **SAMPLING), refits=2, **SAMPLING)
+    figure = Figure()
+    left, right = figure.subplots(1, 2)
+    assert plot_influence(result, right) is right
+    FigureCanvasAgg(figure).draw()
+    assert not left.has_data()
+    estimated, exact = right.lines
+    np.testing.assert_array_equal(estimated.get_ydata(), result["shift_estimated"])
+    np.testing.assert_array_equal(np.isfinite(exact.get_ydata()), result["refitted"])
+    assert len(right.texts) == int((result["pareto_k"] > 0.7).sum()) > 0
+
+
+def test_a_negative_number_of_refits_is_refused():
+    tree = sample_posterior(CONTRADICTED[:1], **SAMPLING)
+    with pytest.raises(ValueError, match="refits: expected a number >= 0 or None, got -1"):
+        influence(tree, refits=-1)

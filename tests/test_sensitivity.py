@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.stats import norm
+
+from bayespbrl.diagnostics import plot_sensitivity, sensitivity
+from bayespbrl.models import sample_posterior
+
+SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+DIFFERENCES = np.array([[0.9, -0.4, 0.0], [0.5, 0.8, 0.0], [0.0, 0.0, 0.0]])
+
+
+def of_component(result, component):
+    return result["sensitivity"].sel(component=component).values
+
+
+def sensitivity_of_a_normal(low, high, alpha=1.01):
+    """The cumulative Jensen-Shannon distance of N(0, 1) and N(0, 1/α) per log₂ α, by quadrature from low to high.
+
+    Source: Kallioinen et al. (2024), eqs. 9-11.
+    """
+    x, step = np.linspace(low, high, 40001, retstep=True)
+    p, q = norm.cdf(x), norm.cdf(x * np.sqrt(alpha))
+    middle = (p + q) / 2
+    divergence = np.sum(p * np.log2(p / middle) + q * np.log2(q / middle)) * step
+    return np.sqrt(divergence / (np.sum(p + q) * step)) / np.log2(alpha)
+
+
+def test_utility_that_no_answer_has_seen_depends_on_the_prior_scale_alone():
+    tree = sample_posterior(DIFFERENCES, **SAMPLING)
+    result = sensitivity(tree, np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.001]]))
+    assert np.all(of_component(result, "prior") > 0.06)
+    assert np.all(of_component(result, "likelihood") < 0.03)
+    assert list(result["diagnosis"].values) == ["prior", "prior"]
+    # the unit of a utility is nobody's business
+    np.testing.assert_allclose(*of_component(result, "prior"), rtol=1e-9)
+
+
+def test_answers_that_say_nothing_have_no_weight():
+    tree = sample_posterior(DIFFERENCES, likelihood="logistic", steepness=1e-4, **SAMPLING)
+    result = sensitivity(tree)
+    assert np.all(of_component(result, "likelihood") < 0.01)
+    assert np.all(of_component(result, "prior")[:2] > 0.06)
+
+
+def test_answers_that_fix_a_utility_take_the_weight_from_the_prior():
+    # six answers against two of the same pair: at steepness 20 the utility is known to a tenth of its prior spread
+    rows = np.array([[0.4, 0.1]] * 6 + [[-0.4, -0.1]] * 2)
+    vague, sharp = (
+        sensitivity(sample_posterior(rows, likelihood="logistic", steepness=m, **SAMPLING)) for m in (0.5, 20)
+    )
+    assert of_component(sharp, "prior")[0] < of_component(vague, "prior")[0] / 3
+    assert of_component(sharp, "likelihood")[0] > 3 * of_component(sharp, "prior")[0]
+
+
+def test_features_that_are_the_differences_have_the_sensitivity_of_the_margins():
+    tree = sample_posterior(DIFFERENCES, **SAMPLING)
+    margins, utilities = sensitivity(tree), sensitivity(tree, DIFFERENCES)
+    np.testing.assert_allclose(utilities["sensitivity"], margins["sensitivity"], rtol=1e-6)
+
+
+def test_a_row_of_zeros_is_insensitive():
+    result = sensitivity(sample_posterior(DIFFERENCES, **SAMPLING))
+    np.testing.assert_array_equal(result["sensitivity"][:, 2], 0)
+    assert result["diagnosis"].values[2] == "neither"
+    assert np.all(result["sensitivity"][:, :2] > 0)
+
+
+def test_scaling_the_power_of_the_prior_is_scaling_its_spread():
+    scale = 2.5
+    z = scale * np.random.default_rng(0).standard_normal((4, 2000, 1))
+    tree = xr.DataTree.from_dict(
+        {
+            "/": xr.Dataset(attrs={"prior_scale": scale}),
+            "/posterior": xr.Dataset(
+                {"margins": (("chain", "draw", "preference"), z), "coordinates": (("chain", "draw", "coordinate"), z)}
+            ),
+            "/log_likelihood": xr.Dataset({"answers": (("chain", "draw", "preference"), np.zeros((4, 2000, 1)))}),
+        }
+    )
+    result = sensitivity(tree)
+    assert of_component(result, "likelihood")[0] == 0
+    assert of_component(result, "prior")[0] == pytest.approx(
+        sensitivity_of_a_normal(z.min() / scale, z.max() / scale), rel=0.05
+    )
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_with_no_answer_or_one_there_is_a_result_of_that_size(number):
+    tree = sample_posterior(DIFFERENCES[:number], **SAMPLING)
+    result = sensitivity(tree)
+    assert dict(result.sizes) == {"component": 2, "quantity": number}
+    unseen = sensitivity(tree, np.array([[0.0, 0.0, 1.0]]))
+    assert of_component(unseen, "likelihood")[0] < 0.03 < of_component(unseen, "prior")[0]
+    axes = Figure().subplots()
+    assert plot_sensitivity(result, axes) is axes
+
+
+def test_the_figure_has_two_bars_a_quantity_on_the_axes_given():
+    figure = Figure()
+    left, right = figure.subplots(1, 2)
+    result = sensitivity(sample_posterior(DIFFERENCES, **SAMPLING))
+    assert plot_sensitivity(result, right) is right
+    FigureCanvasAgg(figure).draw()
+    assert not left.has_data()
+    heights = [bar.get_height() for bar in right.patches]
+    np.testing.assert_allclose(heights, result["sensitivity"].values.ravel())
+
+
+@pytest.mark.parametrize("features", [np.zeros(3), np.zeros((2, 2)), np.array([[np.inf, 0.0, 0.0]])])
+def test_features_that_do_not_fit_are_refused(features):
+    tree = sample_posterior(DIFFERENCES, **SAMPLING)
+    with pytest.raises(ValueError, match=r"features: expected .* got"):
+        sensitivity(tree, features)
