@@ -37,7 +37,7 @@ def report(margins: np.ndarray, seconds: float, compile_seconds: float) -> dict:
 
 
 def ours(differences: np.ndarray, *, steepness: float, prior_scale: float, num_chains: int, seed: int) -> dict:
-    """`sample_posterior` with its default arguments: factorisation, expectation propagation, warm-up and diagnosis."""
+    """`sample_posterior` with its defaults, diagnosis included; of three runs the one of median speed."""
 
     def run(seed: int) -> tuple[np.ndarray, float]:
         begin = time.perf_counter()
@@ -46,9 +46,10 @@ def ours(differences: np.ndarray, *, steepness: float, prior_scale: float, num_c
         )
         return np.asarray(tree["posterior/margins"]), time.perf_counter() - begin
 
-    _, first = run(seed + 1)
-    margins, seconds = run(seed)
-    return report(margins, seconds, max(first - seconds, 0.0))
+    _, first = run(seed)
+    runs = [run(seed + i) for i in range(3)]
+    reports = [report(margins, seconds, max(first - seconds, 0.0)) for margins, seconds in runs]
+    return sorted(reports, key=lambda figures: figures["effective_draws_per_second"])[1]
 
 
 def theirs(
