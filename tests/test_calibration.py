@@ -103,6 +103,8 @@ def test_equal_forecasts_are_one_point_of_the_curve_in_whatever_order_they_come(
         result = score_predictions(predicted, np.array(answers))
         np.testing.assert_allclose(result["frequency"], [1 / 3, 1])
         np.testing.assert_allclose(result["forecast"], [0.5, 0.9])
+    pooled = score_predictions(predicted, np.array([True, True, False, False]))
+    np.testing.assert_allclose(pooled["frequency"], [0.5, 0.5])  # of four answers, not of two forecasts
 
 
 def test_a_sure_prediction_that_fails_costs_everything_and_one_that_holds_nothing():

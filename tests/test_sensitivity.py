@@ -56,8 +56,9 @@ def test_answers_that_fix_a_utility_take_the_weight_from_the_prior():
 
 
 def test_features_that_are_the_differences_have_the_sensitivity_of_the_margins():
-    tree = sample_posterior(DIFFERENCES, **SAMPLING)
-    margins, utilities = sensitivity(tree), sensitivity(tree, DIFFERENCES)
+    rows = np.array([[0.31, -0.47, 0.11, 0.83], [0.57, 0.29, -0.71, 0.13], [0.19, 0.23, 0.41, -0.61]])
+    tree = sample_posterior(rows, **SAMPLING)
+    margins, utilities = sensitivity(tree), sensitivity(tree, rows)
     np.testing.assert_allclose(utilities["sensitivity"], margins["sensitivity"], rtol=1e-6)
 
 

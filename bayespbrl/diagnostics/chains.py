@@ -4,6 +4,7 @@ import numpy as np
 import xarray as xr
 from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from bayespbrl.diagnostics.convergence import convergence as convergence_of_draws
 
@@ -65,6 +66,7 @@ def plot_convergence(result: xr.Dataset, axes: Axes) -> Axes:
         ylim=(0, None),
         title=f"{verdict}, largest R̂ {result.attrs['rhat_max']:.3f}",
     )
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend()
     return axes
 
@@ -92,7 +94,7 @@ def plot_ranks(tree: xr.DataTree, axes: Axes, *, preference: int | None = None, 
     ranks = np.argsort(np.argsort(draws, axis=None)).reshape(draws.shape)
     for chain, row in enumerate(ranks):
         counts, edges = np.histogram(row, bins=bins, range=(0, draws.size))
-        axes.stairs(counts * bins / row.size, edges, label=f"chain {chain}")
+        axes.stairs(counts * bins / row.size, edges, baseline=None, label=f"chain {chain}")
     axes.axhline(1.0, color="0.5", linestyle="--", linewidth=1)
     axes.set(xlabel="rank", ylabel="relative frequency", ylim=(0, None), title=f"Ranks of margin {preference}")
     axes.legend(fontsize=7)

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_probabilities, refit, tied_rows
 
@@ -21,13 +22,13 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
 
     Args:
       tree: what `sample_posterior` returned.
-      refits: how many answers are left out by an exact refit, those with k̂ above 0.7 first, and among
-        equals those whose estimated change is largest; None for all.
+      refits: how many answers are left out by an exact refit, those whose change by importance weights is
+        largest (on real answers the same, nearly, as those whose exact change is; k̂ is not); None for all.
       sampling_options: `num_samples` and the like of the refits; eq. 8 keeps the full K.
 
     Returns:
-      along `preference`: `pareto_k`; `shift_estimated`, the length of the change of the mean utility weights over the
-      prior scale, by importance weights; where `refitted`, and NaN elsewhere: `shift`, the same by the refit,
+      along `preference`: `pareto_k`; `change_estimated`, the length of the change of the mean utility weights over the
+      prior scale, by importance weights; where `refitted`, and NaN elsewhere: `change`, the same by the refit,
       `probability` of the answer given the others, and `margin_means` (preference, margin), the means of all margins
       without the answer; `converged`, whether the refit did. Beside them `margin_mean` (margin), the means with all.
 
@@ -41,25 +42,23 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
     weights = np.asarray(tree["utility_weights_mean"])
     scale = float(tree.attrs["prior_scale"])
     pareto_k, estimated = _estimates(tree)
-    # an estimate whose weights cannot be trusted may be far too small
-    order = np.lexsort((-estimated, pareto_k <= PARETO_K_LIMIT))
-    chosen = order[:refits]
-    shift, probability = np.full(number, np.nan), np.full(number, np.nan)
+    chosen = np.argsort(-estimated, kind="stable")[:refits]
+    changes, probability = np.full(number, np.nan), np.full(number, np.nan)
     means, converged = np.full((number, number), np.nan), np.zeros(number, dtype=bool)
     outcome = np.where(tied_rows(tree), TIED, PREFERRED)
     for k in chosen:
         others = refit(tree, np.arange(number) != k, **sampling_options)
-        change = weights - np.asarray(others["utility_weights_mean"])
-        shift[k] = np.linalg.norm(change) / scale
+        mean = np.asarray(others["utility_weights_mean"])
+        changes[k] = np.linalg.norm(weights - mean) / scale
         probability[k] = answer_probabilities(others, differences[[k]])[0, outcome[k]]
-        means[k] = differences @ np.asarray(others["utility_weights_mean"])
+        means[k] = differences @ mean
         converged[k] = bool(others.attrs["converged"])
     return xr.Dataset(
         {
             "pareto_k": ("preference", pareto_k),
-            "shift_estimated": ("preference", estimated / scale),
+            "change_estimated": ("preference", estimated / scale),
             "refitted": ("preference", np.isin(np.arange(number), chosen)),
-            "shift": ("preference", shift),
+            "change": ("preference", changes),
             "probability": ("preference", probability),
             "converged": ("preference", converged),
             "margin_means": (("preference", "margin"), means),
@@ -71,13 +70,14 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
 def plot_influence(result: xr.Dataset, axes: Axes) -> Axes:
     """Change of the mean utility weights by each answer, exact where it was refitted; k̂ where above its limit."""
     numbers = np.arange(result.sizes["preference"])
-    axes.plot(numbers, result["shift_estimated"], "o", markersize=4, fillstyle="none", label="by importance weights")
-    axes.plot(numbers, result["shift"], "o", markersize=4, label="by exact refit")
-    highest = np.fmax(result["shift_estimated"].values, result["shift"].values)
+    axes.plot(numbers, result["change_estimated"], "o", markersize=4, fillstyle="none", label="by importance weights")
+    axes.plot(numbers, result["change"], "o", markersize=4, label="by exact refit")
+    highest = np.fmax(result["change_estimated"].values, result["change"].values)
     for k in numbers[result["pareto_k"].values > PARETO_K_LIMIT]:
         text = f"k̂ {float(result['pareto_k'][k]):.1f}"
         axes.annotate(text, (k, highest[k]), xytext=(3, 3), textcoords="offset points", fontsize=7)
-    axes.set(xlabel="answer left out", ylabel="shift of mean weights / σ", ylim=(0, None), title="Influence")
+    axes.set(xlabel="answer left out", ylabel="change of the mean weights / σ", ylim=(0, None), title="Influence")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend()
     return axes
 

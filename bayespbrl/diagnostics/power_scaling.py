@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from arviz_stats import psense
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from bayespbrl.diagnostics.predictions import checked_differences
 from bayespbrl.models.low_rank import low_rank
@@ -69,6 +70,7 @@ def plot_sensitivity(result: xr.Dataset, axes: Axes) -> Axes:
         axes.bar(numbers + offset, result["sensitivity"].sel(component=component), 0.4, label=labels[component])
     axes.axhline(result.attrs["threshold"], color="0.5", linestyle="--", linewidth=1)
     axes.set(xlabel="quantity", ylabel="power-scaling sensitivity", title="Sensitivity")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend()
     return axes
 
