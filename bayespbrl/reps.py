@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
+ITERATIONS = 500  # cap of the solver; some twenty are usual
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,8 @@ def reps_weights(
     scale = spread if informative else 1.0
     standardised = (q_values - mean) / scale if informative else np.zeros_like(q_values)
     temperature, dual, converged, status = _solve_dual(standardised, whitened, base_weights, kl_bound)
+    if not converged:  # what an unfinished solver leaves is no update: stay where we are, and say so
+        temperature, dual, standardised = 1.0, np.zeros_like(dual), np.zeros_like(standardised)
     logits = np.log(base_weights) + (standardised - whitened @ dual) / temperature  # (eq. 12)
     probabilities = np.exp(logits - np.max(logits))
     probabilities /= np.sum(probabilities)
@@ -150,7 +153,7 @@ def _solve_dual(
         "ipopt.hessian_approximation": "limited-memory",
         "ipopt.limited_memory_max_history": 20,
         "ipopt.tol": 1e-8,
-        "ipopt.max_iter": 500,
+        "ipopt.max_iter": ITERATIONS,
     }
     problem: Any = {"x": unknown, "f": dual}
     solver = ca.nlpsol("reps_dual", "ipopt", problem, options)

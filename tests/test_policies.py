@@ -421,3 +421,13 @@ def test_the_softmax_says_when_its_iterations_did_not_suffice():
     separated = initial("softmax").fit(observations, actions, np.ones(300), rng=rng)
     assert separated.converged
     assert np.isfinite(separated.probabilities(observations * 100)).all()
+
+
+def test_a_tabular_fit_keeps_the_minimum_probability_of_every_action():
+    policy = TabularPolicy.initial(Discrete(2), Discrete(4), minimum_probability=0.01)
+    fitted = policy.fit(np.array([0, 0]), np.array([1, 2]), np.array([3.0, 1.0]))
+    np.testing.assert_allclose(fitted.table[0], [0.01, 0.01 + 0.96 * 0.75, 0.01 + 0.96 * 0.25, 0.01])
+    np.testing.assert_allclose(fitted.table[1], 0.25)
+    assert fitted.fit(np.array([0]), np.array([0]), np.array([1.0])).table[0, 1] == pytest.approx(0.01)
+    with pytest.raises(ValueError, match="minimum_probability"):
+        TabularPolicy.initial(Discrete(2), Discrete(4), minimum_probability=0.25)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from bayespbrl import reps
 from bayespbrl.reps import reps_weights
 
 
@@ -117,3 +118,13 @@ def test_bad_arrays_are_named():
         reps_weights(np.where(q_values > 3, np.nan, q_values), features, base, kl_bound=0.1)
     with pytest.raises(ValueError, match="base_weights"):
         reps_weights(q_values, features, 2 * base, kl_bound=0.1)
+
+
+def test_a_solver_that_fails_leaves_the_policy_as_it_is_and_says_so(monkeypatch):
+    monkeypatch.setattr(reps, "ITERATIONS", 1)
+    q_values, features, base = random_problem()
+    solution = reps.reps_weights(q_values, features, base, kl_bound=0.2)
+    assert not solution.converged
+    assert "Maximum_Iterations" in solution.status
+    np.testing.assert_allclose(solution.sample_weights, 1.0)
+    assert solution.kl == pytest.approx(0.0, abs=1e-12)

@@ -10,6 +10,10 @@ from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
+# Share of a tabular policy's choices that stay uniform. On the Gridworld it costs 0.2 % of the optimum (the known
+# reward ends at 0.998) and keeps the dual well-conditioned; without it one fit in 500 failed.
+LEAST_EXPLORATION = 0.01
+
 
 def initial_policy(
     kind: str, observation_space: Space, action_space: Space, *, action_scale: float = 0.75, period: Any = None
@@ -32,7 +36,8 @@ def initial_policy(
             kind = "tabular" if isinstance(observation_space, Discrete) else "softmax"
     match kind:
         case "tabular":
-            return TabularPolicy.initial(observation_space, action_space)
+            least = LEAST_EXPLORATION / getattr(action_space, "n", 1)
+            return TabularPolicy.initial(observation_space, action_space, minimum_probability=float(least))
         case "softmax":
             return SoftmaxPolicy.initial(observation_space, action_space, period=period)
         case "linear-gaussian":

@@ -1,6 +1,6 @@
 """A table π(a|s) for discrete states and actions, fitted by weighted maximum likelihood in closed form (eq. 14)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import jax
@@ -20,16 +20,21 @@ class TabularPolicy:
 
     Attributes:
       table: probabilities, shape (states, actions), rows sum to one.
+      minimum_probability: a fit mixes in as much of the uniform policy as gives every action this probability: an action
+        at zero would have no sample any more, and could never come back.
     """
 
     table: np.ndarray
+    minimum_probability: float = field(default=0.0, metadata={"static": True})
 
     @classmethod
-    def initial(cls, observation_space: Space, action_space: Space) -> Self:
+    def initial(cls, observation_space: Space, action_space: Space, *, minimum_probability: float = 0.0) -> Self:
         """The uniform policy. `ValueError` unless both spaces are `Discrete` and start at zero."""
         states = number_of_values("observation_space", observation_space)
         actions = number_of_values("action_space", action_space)
-        return cls(np.full((states, actions), 1.0 / actions))
+        if not 0 <= minimum_probability * actions < 1:
+            raise ValueError(f"minimum_probability: expected a number in [0, 1/{actions}), got {minimum_probability}")
+        return cls(np.full((states, actions), 1.0 / actions), minimum_probability)
 
     def sample(self, key: jax.Array, observation: Any) -> Any:
         """a ~ π(·|s), an integer scalar."""
@@ -60,7 +65,9 @@ class TabularPolicy:
         rng: np.random.Generator | None = None,
         base_weights: np.ndarray | None = None,
     ) -> Self:
-        """π(a|s) ∝ Σᵢ Wᵢwᵢ over the samples at (s, a) (eq. 14); a state without any weight keeps its row.
+        """π(a|s) ∝ Σᵢ Wᵢwᵢ over the samples at (s, a) (eq. 14), mixed with `minimum_probability` of each action.
+
+        A state without any weight keeps its row.
 
         Args:
           observations, actions: integers, shape (N,).
@@ -80,4 +87,6 @@ class TabularPolicy:
         cells = samples.observations * number_of_actions + samples.actions
         mass = np.bincount(cells, weights=samples.weights, minlength=table.size).reshape(table.shape)
         visits = mass.sum(axis=1, keepdims=True)
-        return type(self)(np.where(visits > 0, mass / np.where(visits > 0, visits, 1.0), table))
+        uniform_share = self.minimum_probability * number_of_actions
+        fitted = (1 - uniform_share) * mass / np.where(visits > 0, visits, 1.0) + self.minimum_probability
+        return type(self)(np.where(visits > 0, fitted, table), self.minimum_probability)
