@@ -27,6 +27,7 @@ Likelihood = Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or
 PriorScale = Annotated[float | None, typer.Option(help="Prior standard deviation of a utility weight.")]
 Steepness = Annotated[float | None, typer.Option(help="Of the likelihood, in units of the largest difference.")]
 LapseRate = Annotated[float | None, typer.Option(help="Share of answers that the model takes for coin tosses.")]
+Discount = Annotated[float | None, typer.Option(help="Of features and rewards, in [0, 1); the paper's is 0.98.")]
 WrongAnswers = Annotated[float | None, typer.Option(help="Share of the simulated expert's answers turned round.")]
 PolicyKind = Annotated[
     str | None, typer.Option("--policy", help="auto, tabular, softmax, linear-gaussian or gaussian-process.")
@@ -46,7 +47,8 @@ def run(
     prior_scale: PriorScale = None,
     steepness: Steepness = None,
     lapse_rate: LapseRate = None,
-    wrong_answers: WrongAnswers = None,
+    wrong_answers: Discount = Annotated[float | None, typer.Option(help="Of features and rewards, in [0, 1); the paper's is 0.98.")]
+WrongAnswers = None,
     policy: PolicyKind = None,
     centres: Centres = None,
     max_steps: MaxSteps = None,
@@ -83,7 +85,8 @@ def trials(
     prior_scale: PriorScale = None,
     steepness: Steepness = None,
     lapse_rate: LapseRate = None,
-    wrong_answers: WrongAnswers = None,
+    wrong_answers: Discount = Annotated[float | None, typer.Option(help="Of features and rewards, in [0, 1); the paper's is 0.98.")]
+WrongAnswers = None,
     policy: PolicyKind = None,
     centres: Centres = None,
     max_steps: MaxSteps = None,

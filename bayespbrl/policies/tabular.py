@@ -20,8 +20,8 @@ class TabularPolicy:
 
     Attributes:
       table: probabilities, shape (states, actions), rows sum to one.
-      minimum_probability: a fit mixes in as much of the uniform policy as gives every action this probability: an action
-        at zero would have no sample any more, and could never come back.
+      minimum_probability: a fit mixes in as much of the uniform policy as gives every action this probability: an
+        action at zero would have no sample any more, and could never come back.
     """
 
     table: np.ndarray
