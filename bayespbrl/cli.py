@@ -47,8 +47,8 @@ def run(
     prior_scale: PriorScale = None,
     steepness: Steepness = None,
     lapse_rate: LapseRate = None,
-    wrong_answers: Discount = Annotated[float | None, typer.Option(help="Of features and rewards, in [0, 1); the paper's is 0.98.")]
-WrongAnswers = None,
+    discount: Discount = None,
+    wrong_answers: WrongAnswers = None,
     policy: PolicyKind = None,
     centres: Centres = None,
     max_steps: MaxSteps = None,
@@ -85,8 +85,8 @@ def trials(
     prior_scale: PriorScale = None,
     steepness: Steepness = None,
     lapse_rate: LapseRate = None,
-    wrong_answers: Discount = Annotated[float | None, typer.Option(help="Of features and rewards, in [0, 1); the paper's is 0.98.")]
-WrongAnswers = None,
+    discount: Discount = None,
+    wrong_answers: WrongAnswers = None,
     policy: PolicyKind = None,
     centres: Centres = None,
     max_steps: MaxSteps = None,

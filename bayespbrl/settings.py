@@ -112,10 +112,11 @@ def _whole(name: str, value: Any, least: int) -> None:
 # One row a domain: what differs from the defaults above, with the evidence for each number. Ten trajectories an
 # iteration and the paper's number of answers are the protocol and not for tuning.
 PRESETS: dict[str, dict[str, Any]] = {
-    # discount: the expert judges 300 undiscounted steps, and the paper's 0.98 lets ψ and Q see only the first fifty or so.
-    # Seeds 0-19, posterior mean, answers at which the lower quartile reaches 0.99 of the optimum: not by answer 11 with
-    # 0.98 (0.50 there), 10 with 0.99, 8 with 0.995; the median by 6 or 7 with each. Steepness 1 or 5, a lapse rate of 0.1,
-    # the logistic likelihood, and bounds of 0.15, 0.2 and 0.5 in place of 0.3 made no such difference.
+    # discount: the expert judges 300 undiscounted steps, and the paper's 0.98 lets ψ and Q see only the first fifty or
+    # so. Seeds 0-19, posterior mean: with 0.98 the lower quartile is at 0.50 of the optimum at answer 11, with 0.99 it
+    # reaches 0.99 at answer 10 and with 0.995 at answer 8; the median does by answer 6 or 7 with each. Steepness 1 or
+    # 5, a lapse rate of 0.1, the logistic likelihood, and bounds of 0.15, 0.2 and 0.5 in place of 0.3 made no such
+    # difference.
     "gridworld": {"iterations": 25, "discount": 0.995},
 }
 
