@@ -222,13 +222,13 @@ def _optimum(environment: Any) -> float | None:
 
 
 def _print_iterations(learner: Any) -> None:
-    """A row for the first iteration, every fifth and the last."""
+    """A row for the first iteration, every fifth and the last, narrow enough for eighty columns."""
     optimum = _optimum(learner.environment)
     rows = [
         [
             str(s["answers"]),
             f"{s['value']:.2f}",
-            *([] if optimum is None else [f"{s['value'] / optimum:.3f}"]),
+            *([] if optimum is None else [f"{s['value'] / optimum:.1%}"]),
             f"{s['pairs_satisfied']}/{s['pairs']}",
             f"{s['kl']:.3f}/{s['kl_bound']:g}",
             _number(s["rhat_max"], ".3f"),
@@ -237,8 +237,8 @@ def _print_iterations(learner: Any) -> None:
         for s in learner.iterations
         if s["iteration"] % 5 == 0 or s["iteration"] in (1, len(learner.iterations))
     ]
-    share = [] if optimum is None else ["of optimum"]
-    columns = ["answers", "value", *share, "pairs satisfied", "KL/bound", "R̂", "effective draws"]
+    share = [] if optimum is None else ["optimum"]
+    columns = ["answers", "value", *share, "pairs", "KL/bound", "R̂", "draws"]
     _table(f"{learner.settings.env}, {learner.settings.utility}, seed {learner.settings.seed}", columns, rows)
 
 
