@@ -1,0 +1,69 @@
+import json
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+LARGEST = 300_000  # bytes
+# An absolute path of two parts or more (not an address), or one with a drive's letter.
+MACHINE_PATH = re.compile(r"(?<![\w.:/)])/\w[\w.-]*/\w[^\s\"]*|\b[A-Z]:\\\\\w+")
+
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def code_cells(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def without_pictures(notebook):
+    text = json.loads(nbformat.writes(notebook))
+    for cell in text["cells"]:
+        for output in cell.get("outputs", []):
+            output.get("data", {}).pop("image/png", None)
+    return json.dumps(text).replace(r"\n", " ")  # else the n would look like a letter before a path
+
+
+def test_there_is_a_notebook():
+    assert NOTEBOOKS
+
+
+@pytest.mark.slow
+@each_notebook
+def test_every_notebook_runs_from_a_fresh_kernel_without_error_or_warning(path, monkeypatch):
+    monkeypatch.delenv("BAYESPBRL_FULL", raising=False)
+    notebook = nbformat.read(path, as_version=4)
+    for cell in code_cells(notebook):
+        cell.outputs = []
+    NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": path.parent}}
+    ).execute()
+    outputs = [output for cell in code_cells(notebook) for output in cell.outputs]
+    assert outputs
+    assert [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"] == []
+
+
+@each_notebook
+def test_every_kept_notebook_holds_the_outputs_of_one_run_from_top_to_bottom(path):
+    notebook = nbformat.read(path, as_version=4)
+    counts = [cell.execution_count for cell in code_cells(notebook)]
+    assert counts == list(range(1, len(counts) + 1))
+    outputs = [output for cell in code_cells(notebook) for output in cell.outputs]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"] == []
+
+
+@each_notebook
+def test_every_kept_notebook_is_small_and_names_no_machine(path):
+    notebook = nbformat.read(path, as_version=4)
+    assert path.stat().st_size < LARGEST
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert MACHINE_PATH.findall(without_pictures(notebook)) == []
+
+
+@each_notebook
+def test_no_notebook_defines_what_belongs_in_the_package(path):
+    source = "\n".join(cell.source for cell in code_cells(nbformat.read(path, as_version=4)))
+    assert re.findall(r"^\s*(?:async\s+def|def|class)\s+\w+", source, flags=re.MULTILINE) == []
