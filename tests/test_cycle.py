@@ -261,7 +261,8 @@ def test_the_value_is_the_mean_return_of_the_new_policy_on_fixed_episodes():
 def test_a_summary_says_how_the_iteration_went():
     for summary in learner().run(ReturnExpert()).iterations:
         assert summary["kl"] == pytest.approx(0.3, rel=0.01)
-        assert summary["kl_fitted_policy"] == pytest.approx(0.3, rel=0.01)
+        # a little less than the weights' own: the policy keeps a least probability of every action
+        assert 0.95 * 0.3 < summary["kl_fitted_policy"] < 0.3 * 1.001
         assert summary["bound_active"]
         assert summary["feature_gap"] < 1e-6
         assert 0 < summary["rank_kept"] <= 25
