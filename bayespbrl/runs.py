@@ -407,7 +407,12 @@ def _read_estimate(tree: xr.DataTree, features: Any, known: Sequence[type]) -> A
         posterior = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
     quality = records.from_tree(utility.children["quality"])
     return LinearUtility(
-        features, utility.dataset["weights"].values, float(utility.attrs["discount"]), quality, posterior
+        features,
+        utility.dataset["weights"].values,
+        float(utility.attrs["discount"]),
+        quality,
+        posterior,
+        float(utility.attrs["scale"]),
     )
 
 
