@@ -80,7 +80,10 @@ def reps_weights(
     informative = spread > 1e-8 * np.abs(mean)
     scale = spread if informative else 1.0
     standardised = (q_values - mean) / scale if informative else np.zeros_like(q_values)
-    temperature, dual, converged, status = _solve_dual(standardised, whitened, base_weights, kl_bound)
+    if informative:
+        temperature, dual, converged, status = _solve_dual(standardised, whitened, base_weights, kl_bound)
+    else:
+        temperature, dual, converged, status = 1.0, np.zeros(whitened.shape[1]), True, "constant Q: nothing to gain"
     if not converged:  # what an unfinished solver leaves is no update: stay where we are, and say so
         temperature, dual, standardised = 1.0, np.zeros_like(dual), np.zeros_like(standardised)
     logits = np.log(base_weights) + (standardised - whitened @ dual) / temperature  # (eq. 12)
