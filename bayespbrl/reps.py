@@ -77,15 +77,14 @@ def reps_weights(
     mean = base_weights @ q_values
     spread = np.sqrt(base_weights @ (q_values - mean) ** 2)
     # what LSTD's penalties leave of a constant Q is noise, and must not be blown up to the size of the bound
-    informative = spread > 1e-8 * np.abs(mean)
-    scale = spread if informative else 1.0
-    standardised = (q_values - mean) / scale if informative else np.zeros_like(q_values)
-    if informative:
-        temperature, dual, converged, status = _solve_dual(standardised, whitened, base_weights, kl_bound)
-    else:
-        temperature, dual, converged, status = 1.0, np.zeros(whitened.shape[1]), True, "constant Q: nothing to gain"
-    if not converged:  # what an unfinished solver leaves is no update: stay where we are, and say so
-        temperature, dual, standardised = 1.0, np.zeros_like(dual), np.zeros_like(standardised)
+    scale, temperature, converged, status = 1.0, 1.0, True, "constant Q: nothing to gain"
+    standardised, dual = np.zeros_like(q_values), np.zeros(whitened.shape[1])  # the weights that change nothing
+    if spread > 1e-8 * np.abs(mean):
+        scale = spread
+        scaled = (q_values - mean) / scale
+        reached, multipliers, converged, status = _solve_dual(scaled, whitened, base_weights, kl_bound)
+        if converged:  # what an unfinished solver leaves is no update: stay where we are, and say so
+            temperature, dual, standardised = reached, multipliers, scaled
     logits = np.log(base_weights) + (standardised - whitened @ dual) / temperature  # (eq. 12)
     probabilities = np.exp(logits - np.max(logits))
     probabilities /= np.sum(probabilities)
