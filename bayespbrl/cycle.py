@@ -271,7 +271,14 @@ class Learner:
             discount=settings.discount,
             fixed_point_ridge=settings.fixed_point_ridge,
             projection_ridge=settings.projection_ridge,
+            visited=self._recent_states(),
         )
+
+    def _recent_states(self) -> np.ndarray:
+        """The states in which the last iterations acted: those of the policy update."""
+        recent, size = self.settings.recent_iterations, self.settings.trajectories_per_iteration
+        trajectories = self.state.trajectories if recent is None else self.state.trajectories[-recent * size :]
+        return np.concatenate([trajectory.states[:-1] for trajectory in trajectories])
 
     def _state_features(self, rng: np.random.Generator) -> utility.StateFeatures:
         """φ(s): the user's, or drawn anew at states observed so far."""
@@ -331,6 +338,7 @@ def _summary(
         "temperature": reps.temperature,
         "reps_converged": reps.converged,
         "entropy": update.entropy,
+        "action_standard_deviation": update.action_standard_deviation,
         "rhat_max": quality.rhat_max,
         "effective_sample_size_min": quality.effective_sample_size_min,
         "utility_converged": quality.converged,

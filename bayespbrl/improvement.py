@@ -42,6 +42,8 @@ class Improvement:
       reps: sample weights, temperature, KL reached against its bound, feature gaps, rank kept, effective samples.
       kl_fitted_policy: mean KL of the fitted policy from the old one over the states of the update, nats.
       entropy: mean entropy of the fitted policy over the same states, nats.
+      action_standard_deviation: mean of the fitted policy's over the same states, in the action's units, shape (A,);
+        None for discrete actions.
     """
 
     policy: Any
@@ -49,6 +51,7 @@ class Improvement:
     reps: RepsSolution
     kl_fitted_policy: float
     entropy: float
+    action_standard_deviation: np.ndarray | None
 
 
 def improve(
@@ -65,6 +68,7 @@ def improve(
     discount: float,
     fixed_point_ridge: float,
     projection_ridge: float,
+    visited: np.ndarray | None = None,
 ) -> Improvement:
     """One policy update of actor-critic REPS from all observed transitions.
 
@@ -77,6 +81,8 @@ def improve(
       state_action_features: φ(s, a) of Q.
       kl_bound: ε, nats.
       discount, fixed_point_ridge, projection_ridge: of LSTD.
+      visited: states of the policy update, shape (n, S) or (n,); those of all transitions when None. LSTD always has
+        all transitions.
 
     Raises:
       ValueError: utilities that do not fit the transitions or are not finite.
@@ -97,7 +103,7 @@ def improve(
         fixed_point_ridge=fixed_point_ridge,
         projection_ridge=projection_ridge,
     )
-    states, visits = _visited(steps.states)
+    states, visits = _visited(steps.states if visited is None else visited)
     if is_discrete(policy):
         rows, actions, base_weights = _all_actions(policy, states, visits)
     else:
@@ -114,6 +120,7 @@ def improve(
         reps=reps,
         kl_fitted_policy=float(visits @ fitted.kl_divergence(policy, states)),
         entropy=float(visits @ entropies(fitted, states)),
+        action_standard_deviation=None if is_discrete(fitted) else visits @ fitted.action_standard_deviation(states),
     )
 
 

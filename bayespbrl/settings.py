@@ -35,6 +35,8 @@ class Settings:
       max_steps: steps an episode; None for the environment's own limit.
       centres: radial basis functions of each kind of feature.
       bandwidth_factor: multiplies the median rule for the features of Q and V.
+      recent_iterations: the policy update takes the states of so many last iterations; None for those of all. LSTD
+        always has all transitions.
       initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
       fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂.
       expert, wrong_answers: who answers, and the share of a simulated expert's answers that are turned round; kept so
@@ -60,6 +62,7 @@ class Settings:
     max_steps: int | None = None
     centres: int = 300
     bandwidth_factor: float = 1.0
+    recent_iterations: int | None = None
     initial_action_scale: float = 0.75
     fixed_point_ridge: float = 1e-8
     projection_ridge: float = 1e-8
@@ -83,8 +86,9 @@ class Settings:
             _whole(name, getattr(self, name), 1)
         _whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
         _whole("seed", self.seed, 0)
-        if self.max_steps is not None:
-            _whole("max_steps", self.max_steps, 1)
+        for name in ("max_steps", "recent_iterations"):
+            if getattr(self, name) is not None:
+                _whole(name, getattr(self, name), 1)
         for name, limit in (
             ("queries_per_iteration", self.trajectories_per_iteration),
             ("first_queries", self.trajectories_per_iteration - 1),
