@@ -42,8 +42,8 @@ class Improvement:
       reps: sample weights, temperature, KL reached against its bound, feature gaps, rank kept, effective samples.
       kl_fitted_policy: mean KL of the fitted policy from the old one over the states of the update, nats.
       entropy: mean entropy of the fitted policy over the same states, nats.
-      action_standard_deviation: mean of the fitted policy's over the same states, in the action's units, shape (A,);
-        None for discrete actions.
+      action_standard_deviation: mean of the fitted policy's over the same states, one number an action dimension, in
+        the action's units; None for discrete actions.
     """
 
     policy: Any
@@ -51,7 +51,7 @@ class Improvement:
     reps: RepsSolution
     kl_fitted_policy: float
     entropy: float
-    action_standard_deviation: np.ndarray | None
+    action_standard_deviation: tuple[float, ...] | None
 
 
 def improve(
@@ -120,7 +120,9 @@ def improve(
         reps=reps,
         kl_fitted_policy=float(visits @ fitted.kl_divergence(policy, states)),
         entropy=float(visits @ entropies(fitted, states)),
-        action_standard_deviation=None if is_discrete(fitted) else visits @ fitted.action_standard_deviation(states),
+        action_standard_deviation=None
+        if is_discrete(fitted)
+        else tuple((visits @ fitted.action_standard_deviation(states)).tolist()),
     )
 
 

@@ -141,21 +141,30 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
 
 
 def collect(directories: Sequence[Path | str]) -> xr.Dataset:
-    """The summaries of finished runs as one data set over (seed, iteration)."""
+    """The summaries of finished runs as one data set over (seed, iteration).
+
+    Numbers and lists of numbers are kept, the latter with a dimension of their own; None becomes NaN.
+    """
     summaries = [runs.read_summary(path) for path in directories]
-    names = [name for name, value in summaries[0]["iterations"][0].items() if not isinstance(value, str | dict)]
     seeds = [summary["seed"] for summary in summaries]
     iterations = [entry["iteration"] for entry in summaries[0]["iterations"]]
-    variables = {
-        name: (
-            ("seed", "iteration"),
-            np.array([[np.nan if e[name] is None else e[name] for e in s["iterations"]] for s in summaries]),
-        )
-        for name in names
-        if name != "iteration"
-    }
+    variables = {}
+    for name in summaries[0]["iterations"][0]:
+        values = [[entry[name] for entry in summary["iterations"]] for summary in summaries]
+        if name != "iteration" and (figures := _figures(values)) is not None:
+            variables[name] = (("seed", "iteration", f"{name}_dimension")[: figures.ndim], figures)
     attributes = {"env": summaries[0]["env"], "utility": summaries[0]["utility"]}
     return xr.Dataset(variables, {"seed": seeds, "iteration": iterations}, attributes)
+
+
+def _figures(values: Sequence[Sequence[Any]]) -> np.ndarray | None:
+    """Numbers, or lists of numbers that are all as long, as one array; None for anything else."""
+    flat = [value for row in values for value in row if value is not None]
+    lengths = {len(value) if isinstance(value, list) else 0 for value in flat}
+    if len(lengths) > 1 or any(isinstance(value, str | dict) for value in flat):
+        return None
+    missing = [np.nan] * length if (length := max(lengths, default=0)) else np.nan
+    return np.array([[missing if value is None else value for value in row] for row in values])
 
 
 def _write_tables(table: xr.Dataset, directory: Path) -> None:

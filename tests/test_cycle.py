@@ -359,6 +359,8 @@ def test_continuous_actions_and_an_ordinary_environment_are_learned_alike():
     assert run.iterations[-1]["value"] > run.iterations[0]["value"]
     assert run.trajectories[0].states.shape == (6, 1)
     assert all(np.abs(t.actions).max() <= 1 for t in run.trajectories)
+    deviations = [summary["action_standard_deviation"] for summary in run.iterations]
+    assert all(len(deviation) == 1 and 0 < deviation[0] < 0.7 for deviation in deviations)
 
 
 @pytest.mark.parametrize(("break_at", "answers"), [(3, 0), (60, 2), (90, 2)])

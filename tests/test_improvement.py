@@ -117,6 +117,7 @@ def test_the_kl_of_the_fitted_table_is_that_of_reps_and_the_bound(kl_bound):
     new, old = update.policy.table, random_policy().table
     assert update.kl_fitted_policy == pytest.approx(visits @ np.sum(new * np.log(new / old), axis=1), rel=1e-9)
     assert update.entropy == pytest.approx(-visits @ np.sum(new * np.log(new), axis=1), rel=1e-9)
+    assert update.action_standard_deviation is None  # the actions are discrete
 
 
 def test_a_constant_utility_changes_nothing():
@@ -192,6 +193,10 @@ def test_a_continuous_policy_moves_towards_the_better_actions(kind):
     after = sample_actions(update.policy, jax.random.key(5), states)[:, 0]
     assert np.mean((after - best) ** 2) < 0.6 * before
     assert type(update.policy) is kind
+    assert update.action_standard_deviation == pytest.approx(
+        update.policy.action_standard_deviation(states).mean(axis=0)
+    )
+    assert update.action_standard_deviation[0] < policy.action_standard_deviation(states).mean()
 
 
 def test_continuous_actions_are_kept_within_the_bounds_and_discrete_ones_as_they_are():

@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from bayespbrl import load
-from bayespbrl.trials import COLUMNS, run_trials
+from bayespbrl.trials import COLUMNS, collect, run_trials
 
 QUICK = {"utility": "linear-program", "iterations": 2}
 
@@ -43,6 +43,29 @@ def test_quartiles_are_those_of_the_values(study):
     np.testing.assert_allclose(quartiles["median"], np.median(values, axis=0))
     np.testing.assert_allclose(quartiles["lower_quartile"], np.quantile(values, 0.25, axis=0))
     np.testing.assert_array_equal(quartiles["answers"], [2, 3])
+
+
+def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as_nan(tmp_path):
+    for seed in (1, 2):
+        rows = [
+            {
+                "iteration": i,
+                "value": i + seed,
+                "scale": None if i == 1 else 0.5,
+                "spread": [i, 10.0 * seed],
+                "kind": "x",
+            }
+            for i in (1, 2, 3)
+        ]
+        summary = {"env": "e", "utility": "u", "seed": seed, "finished": True, "iterations": rows}
+        (tmp_path / str(seed)).mkdir()
+        (tmp_path / str(seed) / "summary.json").write_text(json.dumps(summary))
+    table = collect([tmp_path / "1", tmp_path / "2"])
+    assert set(table.data_vars) == {"value", "scale", "spread"}
+    np.testing.assert_array_equal(table["value"], [[2, 3, 4], [3, 4, 5]])
+    np.testing.assert_array_equal(table["scale"], 2 * [[np.nan, 0.5, 0.5]])
+    assert table["spread"].shape == (2, 3, 2)
+    np.testing.assert_array_equal(table["spread"].sel(seed=2, iteration=3), [3, 20])
 
 
 def test_a_trial_in_a_process_of_its_own_is_the_run_of_its_seed(study, tmp_path):
