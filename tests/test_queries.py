@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from bayespbrl.queries import highest_utility_candidates, random_candidates, show
+from bayespbrl.models.likelihoods import Logistic, Mixed, Probit, WithLapses
+from bayespbrl.queries import (
+    expected_information,
+    highest_utility_candidates,
+    posterior_candidates,
+    probability_better,
+    random_candidates,
+    show,
+)
 
 
 def test_highest_utility_comes_first_and_equals_stay_in_their_order():
@@ -45,3 +53,139 @@ def test_a_question_names_the_two_and_holds_them_in_the_order_shown():
         assert (query.newcomer, query.incumbent) == (5, 2)
         assert query.trajectories == ("abcdef"[query.first], "abcdef"[query.second])
         assert query.number == number
+
+
+COIN = {"likelihood": Logistic(1.0), "scale": 1.0, "rng": np.random.default_rng(0)}
+# Four draws of three newcomers; the incumbent is 0 in each. Better in 1, 3 and 2 of the four draws; the mean is highest
+# for the first, which is far better in one draw.
+DRAWS = np.array([[9.0, 1.0, 2.0], [-1.0, 1.0, 2.0], [-1.0, 1.0, -2.0], [-1.0, -1.0, -2.0]])
+ZERO = np.zeros(4)
+
+
+def test_probability_better_counts_draws_and_half_of_the_equal_ones():
+    np.testing.assert_array_equal(probability_better(DRAWS, ZERO), [0.25, 0.75, 0.5])
+    np.testing.assert_array_equal(probability_better(DRAWS, DRAWS[:, 1]), [0.375, 0.5, 0.5])
+    # draws of both belong together: shifting both by anything a draw changes nothing
+    shift = np.array([3.0, -40.0, 0.5, 7.0])
+    np.testing.assert_array_equal(probability_better(DRAWS + shift[:, None], shift), [0.25, 0.75, 0.5])
+
+
+def test_rules_order_the_same_draws_each_in_its_way():
+    assert highest_utility_candidates([7, 8, 9], DRAWS.mean(axis=0)) == (7, 8, 9)
+    assert posterior_candidates("probably-better", [7, 8, 9], DRAWS, ZERO, **COIN) == (8, 9, 7)
+    # variances of the order 3/16, 3/16, 1/4: the even match first, then the equal ones by their mean
+    assert posterior_candidates("disagreement", [7, 8, 9], DRAWS, ZERO, **COIN) == (9, 7, 8)
+    # a logistic answer at ±1 is a vague one; at ±2 and evenly split it tells most
+    assert posterior_candidates("information", [7, 8, 9], DRAWS, ZERO, **COIN)[0] == 9
+
+
+def test_candidates_that_the_rule_cannot_tell_apart_come_by_their_mean_then_in_their_order():
+    utilities = np.array([[1.0, 3.0, 2.0, 3.0], [1.0, 3.0, 2.0, 3.0]])
+    for rule in ("probably-better", "disagreement", "information"):
+        likelihood = Mixed(1e9, 1e9)  # every answer is certain, so that none tells anything
+        chosen = posterior_candidates(
+            rule, [4, 5, 6, 7], utilities, np.zeros(2), likelihood=likelihood, scale=1.0, rng=np.random.default_rng(0)
+        )
+        assert chosen == (5, 7, 6, 4)
+
+
+def test_thompson_ranks_by_one_draw_and_picks_each_draw_as_often():
+    rng = np.random.default_rng(2)
+    drawn = [
+        posterior_candidates("thompson", [7, 8, 9], DRAWS, ZERO, likelihood=Logistic(1.0), scale=1.0, rng=rng)
+        for _ in range(2000)
+    ]
+    orders = [
+        (7, 9, 8),
+        (9, 8, 7),
+        (8, 7, 9),
+        (7, 8, 9),
+    ]  # in the last draw 7 and 8 are equal, and 7 has the higher mean
+    assert set(drawn) == set(orders)
+    for order in orders:
+        assert abs(drawn.count(order) / 2000 - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 2000)
+
+
+def test_thompson_is_chosen_by_its_stream():
+    rankings = [
+        [
+            posterior_candidates("thompson", [7, 8, 9], DRAWS, ZERO, likelihood=None, scale=1.0, rng=rng)
+            for _ in range(20)
+        ]
+        for rng in (np.random.default_rng(5), np.random.default_rng(5), np.random.default_rng(6))
+    ]
+    assert rankings[0] == rankings[1]
+    assert rankings[0] != rankings[2]
+
+
+def test_expected_information_of_certain_answers_is_the_entropy_of_the_order():
+    # each draw knows its answer: H(p) = 0, and what remains is the entropy of a coin with the share of draws
+    information = expected_information(DRAWS, ZERO, likelihood=Logistic(1e6))
+    shares = np.array([0.25, 0.75, 0.5])
+    np.testing.assert_allclose(information, -shares * np.log(shares) - (1 - shares) * np.log(1 - shares), atol=1e-12)
+
+
+def test_expected_information_matches_the_mutual_information_of_the_joint_table():
+    rng = np.random.default_rng(4)
+    utilities, incumbent = rng.normal(size=(50, 3)), rng.normal(size=50)
+    scale, steepness = 0.7, 2.0
+    p = 1 / (1 + np.exp(-steepness * scale * (utilities - incumbent[:, None])))
+    expected = []
+    for column in p.T:
+        joint = np.column_stack([column, 1 - column]) / 50  # (draw, answer)
+        independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0)
+        expected.append(np.sum(joint * np.log(joint / independent)))
+    information = expected_information(utilities, incumbent, likelihood=Logistic(steepness), scale=scale)
+    np.testing.assert_allclose(information, expected, rtol=1e-10)
+
+
+def test_answers_that_are_coin_tosses_tell_nothing_and_draws_that_agree_tell_nothing():
+    same = np.full((6, 2), 0.3)
+    np.testing.assert_allclose(expected_information(same, np.zeros(6), likelihood=Logistic(2.0)), 0.0, atol=1e-15)
+    sure = expected_information(DRAWS, ZERO, likelihood=Logistic(3.0))
+    lapsing = expected_information(DRAWS, ZERO, likelihood=WithLapses(Logistic(3.0), 0.4))
+    assert (lapsing < 0.5 * sure).all()
+    tossed = expected_information(DRAWS, ZERO, likelihood=WithLapses(Logistic(3.0), 1 - 1e-9))
+    np.testing.assert_allclose(tossed, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("likelihood", [Mixed(5.0, 40.0), Mixed(5.0, 1.0), Logistic(1e-3), Probit(30.0)])
+def test_expected_information_lies_between_nothing_and_one_bit(likelihood):
+    rng = np.random.default_rng(9)
+    information = expected_information(
+        rng.normal(size=(400, 8)) * 10.0 ** np.arange(-4, 4), np.zeros(400), likelihood=likelihood
+    )
+    assert (information >= 0).all()
+    assert (information <= np.log(2)).all()
+
+
+def test_information_prefers_what_the_posterior_is_unsure_of_over_what_the_expert_is():
+    # The first newcomer equals the incumbent in every draw: its answer is a toss, even so all draws agree on that. The
+    # second is far better or far worse: its answer tells which.
+    utilities = np.column_stack([np.zeros(100), np.repeat([-3.0, 3.0], 50)])
+    for rule in ("information", "disagreement"):
+        order = posterior_candidates(
+            rule, [0, 1], utilities + 1.0, np.ones(100), likelihood=Logistic(5.0), scale=1.0, rng=None
+        )
+        assert order == ((1, 0) if rule == "information" else (0, 1))  # to the order alone both are even matches
+
+
+@pytest.mark.parametrize(
+    ("utilities", "incumbent", "message"),
+    [
+        (DRAWS[:, :2], ZERO, "utilities: expected one for each of 3"),
+        (DRAWS, np.zeros(3), r"utilities: expected draws of shapes \(S, n\) and \(S,\).*got \(4, 3\) and \(3,\)"),
+        (DRAWS[0], ZERO, "utilities: expected draws"),
+        (DRAWS[:0], ZERO[:0], "utilities: expected draws"),
+        (DRAWS * np.nan, ZERO, "utilities: expected finite draws"),
+        (DRAWS, ZERO + np.inf, "utilities: expected finite draws"),
+    ],
+)
+def test_draws_that_do_not_fit_are_refused(utilities, incumbent, message):
+    with pytest.raises(ValueError, match=message):
+        posterior_candidates("probably-better", [1, 2, 3], utilities, incumbent, **COIN)
+
+
+def test_a_rule_there_is_not_is_refused():
+    with pytest.raises(ValueError, match=r"query: expected probably-better, .* got 'entropy'"):
+        posterior_candidates("entropy", [7, 8, 9], DRAWS, ZERO, **COIN)
