@@ -21,13 +21,13 @@ def lstd_q(
     Args:
       features: φ(sᵢ, aᵢ), shape (N, Q).
       next_features: φ(sᵢ′, aᵢ′) with aᵢ′ from the current policy; zero where sᵢ′ is terminal. Shape (N, Q).
-      utilities: uᵢ, shape (N,).
+      utilities: uᵢ, shape (N,); or n of them a transition, (N, n), which one solution serves: θ is linear in u.
       discount: γ in [0, 1).
       fixed_point_ridge: β₁ ≥ 0, the penalty on θ.
       projection_ridge: β₂ ≥ 0, the penalty on the projection. β₁ = β₂ = 0 is ordinary LSTD.
 
     Returns:
-      θ, shape (Q,).
+      θ, shape (Q,), or (Q, n).
 
     Raises:
       ValueError: shapes that do not fit, a discount outside [0, 1), a negative penalty, an entry that is not finite.
@@ -35,9 +35,13 @@ def lstd_q(
     Source: Hoffman, Lazaric, Ghavamzadeh and Munos (2012), "Regularized least squares temporal difference learning
     with nested ℓ2 and ℓ1 penalization", the ℓ2–ℓ2 case; paper, step 2.
     """
-    if features.shape != next_features.shape or utilities.shape != features.shape[:1]:
+    if (
+        features.shape != next_features.shape
+        or utilities.shape[:1] != features.shape[:1]
+        or utilities.ndim not in (1, 2)
+    ):
         raise ValueError(
-            "lstd_q: expected features and next_features (N, Q) and utilities (N,), got "
+            "lstd_q: expected features and next_features (N, Q) and utilities (N,) or (N, n), got "
             f"{features.shape}, {next_features.shape} and {utilities.shape}"
         )
     if not 0 <= discount < 1:
@@ -53,7 +57,8 @@ def lstd_q(
     projected = _solve_symmetric(gram, projection_ridge, np.column_stack([cross, target]))
     mixing = np.eye(size) - discount * projected[:, :size]  # M: X = ΦM
     normal = mixing.T @ gram @ mixing  # XᵀX
-    return _solve_symmetric(normal, fixed_point_ridge, mixing.T @ (gram @ projected[:, size]))
+    projected_target = projected[:, size] if utilities.ndim == 1 else projected[:, size:]
+    return _solve_symmetric(normal, fixed_point_ridge, mixing.T @ (gram @ projected_target))
 
 
 def _solve_symmetric(matrix: np.ndarray, ridge: float, right: np.ndarray) -> np.ndarray:

@@ -56,12 +56,37 @@ def test_features_that_never_occur_get_weight_zero():
     np.testing.assert_allclose(weights, [2.0, 2.0, 2.0, 0.0], atol=1e-9)
 
 
+@pytest.mark.parametrize("unseen", [0, 2])  # features that never occur make the Gram matrix singular
+def test_utilities_side_by_side_give_the_weights_of_each_alone(unseen):
+    rng = np.random.default_rng(5)
+    features, following = (np.pad(rng.normal(size=(30, 4)), [(0, 0), (0, unseen)]) for _ in range(2))
+    utilities = rng.normal(size=(30, 3))
+    options = {"discount": 0.8, "fixed_point_ridge": 0.0, "projection_ridge": 0.0}
+    together = lstd_q(features, following, utilities, **options)
+    alone = [lstd_q(features, following, column, **options) for column in utilities.T]
+    assert together.shape == (4 + unseen, 3)
+    np.testing.assert_allclose(together, np.column_stack(alone), atol=1e-10)
+    mixture = np.array([0.5, -2.0, 1.0])
+    np.testing.assert_allclose(
+        together @ mixture, lstd_q(features, following, utilities @ mixture, **options), atol=1e-10
+    )
+
+
+def test_the_weights_of_one_hot_utilities_on_a_chain_are_the_discounted_visits_to_come():
+    features, following = chain_features(5)
+    visits = lstd_q(features, following, np.eye(5), discount=0.9, **NO_PENALTY)
+    np.testing.assert_allclose(visits, np.linalg.inv(np.eye(5) - 0.9 * following), atol=1e-9)  # (I − γP)⁻¹
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"discount": 1.0}, "discount"),
         ({"projection_ridge": -1.0}, "ridge"),
         ({"utilities": np.ones(4)}, "utilities"),
+        ({"utilities": np.ones((4, 2))}, r"utilities \(N,\) or \(N, n\), got .* and \(4, 2\)"),
+        ({"utilities": np.ones((3, 2, 2))}, "utilities"),
+        ({"utilities": np.full((3, 2), np.nan)}, "finite"),
         ({"utilities": np.array([1.0, np.nan, 0.0])}, "finite"),
     ],
 )
