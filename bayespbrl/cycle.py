@@ -212,16 +212,16 @@ class Learner:
         steps = transitions(state.trajectories)
         update = self._update(estimate, steps)
         clock.append(time.perf_counter())
-        value = rollouts.returns(
+        evaluated = rollouts.returns(
             self.environment,
             update.policy,
             key=self._key(EVALUATE, 0),
             episodes=settings.evaluation_episodes,
             max_steps=settings.max_steps,
-        ).total.mean()
+        )
         clock.append(time.perf_counter())
         seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
-        summary = _summary(state, estimate, update, float(value), seconds)
+        summary = _summary(state, estimate, update, evaluated, seconds)
         size = settings.trajectories_per_iteration
         self._record(
             {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
@@ -317,7 +317,11 @@ class Learner:
 
 
 def _summary(
-    state: LearnerState, estimate: Any, update: improvement.Improvement, value: float, seconds: dict[str, float]
+    state: LearnerState,
+    estimate: Any,
+    update: improvement.Improvement,
+    evaluated: rollouts.Returns,
+    seconds: dict[str, float],
 ) -> dict[str, Any]:
     """What an iteration reports, as plain data."""
     quality, reps = estimate.quality, update.reps
@@ -326,7 +330,8 @@ def _summary(
         "answers": state.preferences.answers,
         "pairs": quality.pairs,
         "pairs_satisfied": quality.pairs_satisfied,
-        "value": value,
+        "value": float(evaluated.total.mean()),
+        "terminated": float(evaluated.terminated.mean()),  # a share of the episodes
         "kl_bound": reps.kl_bound,
         "bound_active": reps.bound_active,
         "kl": reps.kl,

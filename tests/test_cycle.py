@@ -256,6 +256,7 @@ def test_the_value_is_the_mean_return_of_the_new_policy_on_fixed_episodes():
     key = jax.random.key(int(np.random.default_rng([7, 6, 0]).integers(2**31)))
     returns = rollouts.returns("gridworld", run.policy, key=key, episodes=3, max_steps=20)
     assert run.iterations[-1]["value"] == returns.total.mean()
+    assert run.iterations[-1]["terminated"] == returns.terminated.mean() == 0
 
 
 def test_a_summary_says_how_the_iteration_went():
@@ -384,6 +385,7 @@ def test_discrete_actions_in_continuous_states_are_learned():
     run.run(ReturnExpert())
     assert run.preferences.answers == 3
     assert all(summary["kl_fitted_policy"] < 0.6 for summary in run.iterations)
+    assert all(summary["terminated"] == 1 for summary in run.iterations)  # every pole fell
 
 
 def compilations_after(run, iteration):
