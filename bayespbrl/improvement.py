@@ -21,14 +21,14 @@ class QFunction:
 
     Attributes:
       features: φ(s, a), from N states and N actions to (N, Q).
-      weights: θ, shape (Q + 1,); the last is the bias.
+      weights: θ, shape (Q + 1,), or (Q + 1, n) for n utilities side by side; the last row is the bias.
     """
 
     features: Callable[[np.ndarray, np.ndarray], np.ndarray]
     weights: np.ndarray
 
     def __call__(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Q of N pairs, shape (N,)."""
+        """Q of N pairs, shape (N,), or (N, n)."""
         return self.features(states, actions) @ self.weights[:-1] + self.weights[-1]
 
 
@@ -92,7 +92,7 @@ def improve(
     if utilities.shape != (len(steps),) or not np.all(np.isfinite(utilities)):
         raise ValueError(f"utilities: expected {len(steps)} finite numbers, got shape {utilities.shape} or NaN")
     next_key, fresh_key = jax.random.split(key)
-    q_function = _estimate_q(
+    q_function = estimate_q(
         policy,
         steps,
         utilities,
@@ -152,7 +152,7 @@ def _all_actions(policy: Any, states: np.ndarray, visits: np.ndarray) -> tuple[n
     return rows, actions, base_weights / np.sum(base_weights)
 
 
-def _estimate_q(
+def estimate_q(
     policy: Any,
     steps: Transitions,
     utilities: np.ndarray,
@@ -164,7 +164,17 @@ def _estimate_q(
     fixed_point_ridge: float,
     projection_ridge: float,
 ) -> QFunction:
-    """LSTD-Q with a bias column, from every observed transition."""
+    """LSTD-Q with a bias column, from every observed transition.
+
+    Args:
+      policy: whose Q.
+      steps: N transitions, under whatever policies.
+      utilities: uᵢ of each, shape (N,), or n of them side by side, (N, n).
+      key: for the fresh action in each next state, where actions cannot be enumerated.
+      action_space: bounds the fresh actions.
+      features: φ(s, a).
+      discount, fixed_point_ridge, projection_ridge: of LSTD.
+    """
     steps, utilities, counts = _counted(steps, utilities)
     current = _with_bias(features(steps.states, steps.actions))
     if is_discrete(policy):
@@ -177,7 +187,7 @@ def _estimate_q(
     weights = lstd_q(
         current * repeats,
         following * repeats,
-        utilities * repeats[:, 0],
+        (utilities.T * repeats[:, 0]).T,
         discount=discount,
         fixed_point_ridge=fixed_point_ridge,
         projection_ridge=projection_ridge,
@@ -191,7 +201,9 @@ def _counted(steps: Transitions, utilities: np.ndarray) -> tuple[Transitions, np
         return steps, utilities, np.ones(len(steps))
     table = np.column_stack([steps.states, steps.actions, steps.next_states, steps.terminal])
     _, first, inverse, counts = np.unique(table, axis=0, return_index=True, return_inverse=True, return_counts=True)
-    means = np.bincount(inverse.ravel(), weights=utilities) / counts
+    columns = utilities.reshape(len(utilities), -1).T
+    sums = [np.bincount(inverse.ravel(), weights=column) for column in columns]
+    means = (np.stack(sums) / counts).T.reshape(-1, *utilities.shape[1:])
     unique = Transitions(
         steps.states[first], steps.actions[first], steps.next_states[first], steps.rewards[first], steps.terminal[first]
     )

@@ -78,6 +78,19 @@ def test_q_is_that_of_the_policy_under_the_observed_frequencies():
     np.testing.assert_allclose(improve(policy, steps, utilities).q_function(states, actions), exact, atol=1e-5)
 
 
+def test_q_of_utilities_side_by_side_is_that_of_each_alone():
+    steps, utilities = random_steps(terminated=True)
+    others = np.random.default_rng(0).normal(size=(len(steps), 2))  # not a function of the state
+    features = StateActionProduct(OneHot(STATES), ACTIONS)
+    options = {"key": jax.random.key(1), "action_space": Discrete(ACTIONS), "features": features, **OPTIONS}
+    together = improvement.estimate_q(random_policy(), steps, np.column_stack([utilities, others]), **options)
+    states, actions = np.divmod(np.arange(STATES * ACTIONS), ACTIONS)
+    for column, alone in enumerate([utilities, *others.T]):
+        q_function = improvement.estimate_q(random_policy(), steps, alone, **options)
+        np.testing.assert_allclose(together(states, actions)[:, column], q_function(states, actions), atol=1e-9)
+    assert together(states, actions).shape == (STATES * ACTIONS, 3)
+
+
 def test_nothing_follows_a_terminal_state():
     # 0 → 1 → terminal 2, each step worth 1: Q(1, ·) = 1, Q(0, ·) = 1 + γ.
     trajectory = Trajectory(np.array([0, 1, 2]), np.array([0, 0]), np.zeros(2), terminated=True)
