@@ -1,4 +1,4 @@
-"""The command line: `bayespbrl run`, `resume`, `trials`."""
+"""The command line: `bayespbrl run`, `resume`, `report`, `trials`."""
 
 import sys
 from pathlib import Path
@@ -73,6 +73,17 @@ def resume(directory: Annotated[Path, typer.Argument(help="Directory of a run th
         console.print(f"{directory}: this run is finished; nothing is left to do.")
         return
     _carry_on(learner)
+
+
+@app.command()
+def report(
+    directory: Annotated[Path, typer.Argument(help="Directory of a run: finished, in progress or broken.")],
+    format: Annotated[str, typer.Option(help="html (one file) or md (pictures beside it).")] = "html",
+) -> None:
+    """Write a diagnostic report of a run into its directory."""
+    from bayespbrl.diagnostics.report import write_report
+
+    console.print(f"Report: {write_report(directory, format=format)}")
 
 
 @app.command()
@@ -257,6 +268,16 @@ def _print_trials(study: Any) -> None:
     columns = ["answers", "25 %", "median", "75 %"] + ([] if optimum is None else ["25 %", "median", "75 %"])
     title = f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials: quartiles of the value"
     _table(title + ("" if optimum is None else ", and as a fraction of the optimum"), columns, rows)
+    if table.attrs["redraws"]:
+        seeds = table.attrs["redrawn_seeds"].replace(" ", ", ")
+        console.print(f"Redrawn for want of a preference: {table.attrs['redraws']} trials, seeds {seeds}.")
+    if "balancing_steps" in table:
+        survival, steps = 1 - table["terminated"].isel(iteration=-1), table["balancing_steps"]
+        console.print(
+            f"Final policies: {float(survival.mean()):.1%} of the evaluation episodes survive "
+            f"(worst trial {float(survival.min()):.1%}); they balance for {float(steps.median()):.0f} steps in the "
+            f"median trial, {float(steps.min()):.0f} in the worst, of {steps.attrs['max_steps']} at most."
+        )
     active = table["bound_active"].values.astype(bool)
     deviation = abs(table["kl"] / table["kl_bound"] - 1).values[active].max(initial=0.0)
     console.print(

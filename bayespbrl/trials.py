@@ -1,25 +1,28 @@
 """The same run for many seeds, side by side: what a claim about learning rests on (paper, "Experiments")."""
 
-import csv
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
-from bayespbrl import runs
+from bayespbrl import runs, trial_tables
+from bayespbrl.envs.opening import environment_name
 from bayespbrl.experts import simulated_expert
 from bayespbrl.rollouts import open_environment
-from bayespbrl.settings import settings_for
+from bayespbrl.settings import Settings, settings_for
 
-COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value")
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+# Environments whose trials have to meet a preference (an answer that is no tie) within so many iterations, and are
+# redrawn where they do not (paper, "Experiments"): all trajectories of an early acrobot may time out alike.
+PREFERENCE_WITHIN = {"bayespbrl/Acrobot-v0": 3}
+MOST_SEEDS_A_TRIAL = 10  # a study that has tried so many gives up: preferences are too rare there
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,8 @@ class Trials:
     """What the trials gave.
 
     Attributes:
-      table: `value` and `answers` over (seed, iteration), and each summary's figures by name.
+      table: `value` and `answers` over (seed, iteration), and each summary's figures by name; `balancing_steps` over
+        seed where lasting is the task. Its attributes `redraws` and `redrawn_seeds` tell in whose place others came.
       path: the directory of the run directories and of the table.
     """
 
@@ -49,80 +53,175 @@ def run_trials(
     trials: int,
     jobs: int = 1,
     seed: int = 1000,
+    preference_within: int | None = None,
     progress: Callable[[int], None] | None = None,
     **settings: Any,
 ) -> Trials:
     """Run seeds `seed` … `seed + trials − 1`, `jobs` at a time, each in a run directory of its own.
 
     Finished ones are kept as they are and unfinished ones go on where they stopped, so a study can be cut and resumed.
+    A trial that meets no preference in its first iterations is left as it is then, and the next unused seed above the
+    block takes its place.
 
     Args:
       env: a short name or a gymnasium id.
       directory: of the study; `seed-1000` and so on within it, and `trials.csv` and `trials.nc`.
       trials, jobs: at least 1.
       seed: the first.
+      preference_within: how many iterations a trial has to meet a preference; where None, three for the acrobot, whose
+        trajectories may all time out alike, and any number elsewhere.
       progress: called with the seed of each trial that is finished.
       **settings: options of `Settings`.
 
     Raises:
-      ValueError: bad options; a trial in the directory with other settings; a trial that failed, by its seed.
+      ValueError: bad options; a trial in the directory with other settings; a trial that failed, by its seed; too few
+        seeds that meet a preference.
     """
-    for name, number in (("trials", trials), ("jobs", jobs)):
+    for name, number in (("trials", trials), ("jobs", jobs), ("preference_within", preference_within)):
+        if number is None and name == "preference_within":
+            continue
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise ValueError(f"{name}: expected a whole number >= 1, got {number!r}")
     directory = Path(directory)
     if directory.exists() and not directory.is_dir():
         raise ValueError(f"{directory}: expected a directory for the trials, got a file")
-    open_environment(env).close()
-    plans = [settings_for(env, **settings, seed=number) for number in range(seed, seed + trials)]
-    if plans[0].expert != "return":
-        raise ValueError(f"expert: expected return, trials are simulated, got {plans[0].expert!r}")
-    missing = []
-    for plan in plans:
-        path = directory / f"seed-{plan.seed}"
-        if path.exists():
-            kept = runs.RunDirectory.open(path)
-            if kept.settings != plan:
-                raise ValueError(f"{path}: expected a trial with these settings, got one with others: {kept.settings}")
-            if kept.finished():
-                continue
-        missing.append((path, plan.seed))
-    failures = _in_parallel(env, missing, jobs, settings, progress)
-    if failures:
-        raise ValueError(f"{len(failures)} of {trials} trials failed; the first: {failures[0]}")
-    table = collect([directory / f"seed-{plan.seed}" for plan in plans])
-    _write_tables(table, directory)
+    environment = open_environment(env)
+    identity = environment_name(environment)
+    environment.close()
+    plan = settings_for(env, **settings, seed=seed)
+    if plan.expert != "return":
+        raise ValueError(f"expert: expected return, trials are simulated, got {plan.expert!r}")
+    study = _Study(
+        env=env,
+        directory=directory,
+        settings=plan,
+        options=settings,
+        preference_within=PREFERENCE_WITHIN.get(identity) if preference_within is None else preference_within,
+        balancing_steps=trial_tables.BALANCING_STEPS.get(identity),
+    )
+    seeds = _Seeds(study, trials)
+    _in_parallel(seeds, jobs, progress)
+    redrawn = seeds.with_outcome(False)
+    table = trial_tables.collect([study.path(number) for number in seeds.with_outcome(True)])
+    table.attrs |= {"redraws": len(redrawn), "redrawn_seeds": " ".join(map(str, redrawn))}
+    trial_tables.write_tables(table, directory)
     return Trials(table, directory)
 
 
-def _in_parallel(
-    env: str,
-    missing: Sequence[tuple[Path, int]],
-    jobs: int,
-    settings: dict[str, Any],
-    progress: Callable[[int], None] | None,
-) -> list[str]:
-    """Run the missing trials in spawned processes; messages of those that failed."""
+@dataclass(frozen=True)
+class _Study:
+    """What all trials of a study share; plain data, because child processes are given it.
+
+    Attributes:
+      settings: of the first seed, in full; `options` as they were given.
+      preference_within: None where trials need no preference.
+      balancing_steps: None where lasting is not the task.
+    """
+
+    env: str
+    directory: Path
+    settings: Settings
+    options: dict[str, Any]
+    preference_within: int | None
+    balancing_steps: int | None
+
+    def path(self, seed: int) -> Path:
+        return self.directory / f"seed-{seed}"
+
+    def outcome(self, seed: int) -> bool | None:
+        """Whether a trial on disk counts (True) or is redrawn (False); None where there is something left to do.
+
+        Raises:
+          ValueError: a run with other settings, or none at all.
+        """
+        path = self.path(seed)
+        if not path.exists():
+            return None
+        kept = runs.RunDirectory.open(path)
+        if kept.settings != replace(self.settings, seed=seed):
+            raise ValueError(f"{path}: expected a trial with these settings, got one with others: {kept.settings}")
+        if (path / "summary.json").exists() and self.redraws(runs.read_summary(path)["iterations"]):
+            return False
+        measured = self.balancing_steps is None or trial_tables.has_balancing(path)
+        return True if measured and kept.finished() else None
+
+    def redraws(self, iterations: Sequence[Any]) -> bool:
+        """Whether the iterations within which a preference has to come are over without one."""
+        within = self.preference_within
+        return within is not None and len(iterations) >= within and iterations[within - 1]["pairs"] == 0
+
+
+@dataclass
+class _Seeds:
+    """The seeds of a study from the first upwards, and what became of each: as many as `trials` of them count.
+
+    Which they are does not depend on the order in which trials finish: a seed is added for each that is redrawn.
+    """
+
+    study: _Study
+    trials: int
+    outcomes: dict[int, bool | None] = field(default_factory=dict)
+
+    def with_outcome(self, outcome: bool) -> list[int]:
+        return [seed for seed, what in self.outcomes.items() if what is outcome]
+
+    def to_do(self) -> list[int]:
+        """The seeds with something left to do, once there are enough of them.
+
+        Raises:
+          ValueError: hardly any trial meets a preference.
+        """
+        while len(self.outcomes) - len(redrawn := self.with_outcome(False)) < self.trials:
+            if len(self.outcomes) >= MOST_SEEDS_A_TRIAL * self.trials:
+                raise ValueError(
+                    f"{len(redrawn)} of {len(self.outcomes)} trials met no preference within "
+                    f"{self.study.preference_within} iterations: expected {self.trials} that do"
+                )
+            seed = self.study.settings.seed + len(self.outcomes)
+            self.outcomes[seed] = self.study.outcome(seed)
+        return [seed for seed, what in self.outcomes.items() if what is None]
+
+
+def _in_parallel(seeds: _Seeds, jobs: int, progress: Callable[[int], None] | None) -> None:
+    """Run in spawned processes what is left to do, and what is redrawn in its place."""
     failures: list[str] = []
-    if not missing:
-        return failures
+    running: dict[Future[bool], int] = {}
     with (
         _environment(ONE_THREAD if jobs > 1 else {}),
-        ProcessPoolExecutor(min(jobs, len(missing)), mp_context=multiprocessing.get_context("spawn")) as pool,
+        ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
     ):
-        futures = {pool.submit(_trial, env, path, number, settings): number for path, number in missing}
-        for future in as_completed(futures):
-            if (error := future.exception()) is not None:
-                failures.append(f"seed {futures[future]}: {error}")
-            elif progress is not None:
-                progress(futures[future])
-    return failures
+        started: set[int] = set()
+        while True:
+            for seed in seeds.to_do():
+                if seed not in started:
+                    started.add(seed)
+                    running[pool.submit(_trial, seeds.study, seed)] = seed
+            if not running:
+                break
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                seed = running.pop(future)
+                if (error := future.exception()) is not None:
+                    failures.append(f"seed {seed}: {error}")
+                    continue
+                seeds.outcomes[seed] = future.result()
+                if seeds.outcomes[seed] and progress is not None:
+                    progress(seed)
+    if failures:
+        raise ValueError(f"{len(failures)} of {seeds.trials} trials failed; the first: {failures[0]}")
 
 
-def _trial(env: str, path: Path, seed: int, settings: dict[str, Any]) -> None:
-    """One trial from start to end, or from where it stopped."""
-    learner = runs.resume(path) if path.exists() else runs.start(env, path, **settings, seed=seed)
-    learner.run(simulated_expert(learner.settings.wrong_answers, seed=seed))
+def _trial(study: _Study, seed: int) -> bool:
+    """One trial from start to end, or from where it stopped; whether it counts."""
+    path = study.path(seed)
+    learner = runs.resume(path) if path.exists() else runs.start(study.env, path, **study.options, seed=seed)
+    expert = simulated_expert(learner.settings.wrong_answers, seed=seed)
+    while not study.redraws(learner.state.summaries) and (questions := learner.ask()):
+        learner.tell([expert(*query.trajectories) for query in questions])
+    if study.redraws(learner.state.summaries):
+        return False
+    if study.balancing_steps is not None:
+        trial_tables.measure_balancing(learner, path, max_steps=study.balancing_steps)
+    return True
 
 
 @contextmanager
@@ -138,47 +237,3 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-
-
-def collect(directories: Sequence[Path | str]) -> xr.Dataset:
-    """The summaries of finished runs as one data set over (seed, iteration).
-
-    Numbers and lists of numbers are kept, the latter with a dimension of their own; None becomes NaN.
-    """
-    summaries = [runs.read_summary(path) for path in directories]
-    seeds = [summary["seed"] for summary in summaries]
-    iterations = [entry["iteration"] for entry in summaries[0]["iterations"]]
-    variables = {}
-    for name in summaries[0]["iterations"][0]:
-        values = [[entry[name] for entry in summary["iterations"]] for summary in summaries]
-        if name != "iteration" and (figures := _figures(values)) is not None:
-            variables[name] = (("seed", "iteration", f"{name}_dimension")[: figures.ndim], figures)
-    attributes = {"env": summaries[0]["env"], "utility": summaries[0]["utility"]}
-    return xr.Dataset(variables, {"seed": seeds, "iteration": iterations}, attributes)
-
-
-def _figures(values: Sequence[Sequence[Any]]) -> np.ndarray | None:
-    """Numbers, or lists of numbers that are all as long, as one array; None for anything else."""
-    flat = [value for row in values for value in row if value is not None]
-    lengths = {len(value) if isinstance(value, list) else 0 for value in flat}
-    if len(lengths) > 1 or any(isinstance(value, str | dict) for value in flat):
-        return None
-    missing = [np.nan] * length if (length := max(lengths, default=0)) else np.nan
-    return np.array([[missing if value is None else value for value in row] for row in values])
-
-
-def _write_tables(table: xr.Dataset, directory: Path) -> None:
-    """`trials.csv`, one row a trial and iteration, and `trials.nc`, both renamed into place."""
-    aside = directory / "trials.csv.part"
-    with aside.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for number in table["seed"].values:
-            for iteration in table["iteration"].values:
-                cell = table.sel(seed=number, iteration=iteration)
-                answers, value = int(cell["answers"]), float(cell["value"])
-                writer.writerow([table.attrs["env"], table.attrs["utility"], number, iteration, answers, value])
-    aside.replace(directory / "trials.csv")
-    aside = directory / "trials.nc.part"
-    table.to_netcdf(aside, engine="h5netcdf")
-    aside.replace(directory / "trials.nc")

@@ -1,12 +1,18 @@
 import csv
 import json
+import shutil
+from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 import xarray as xr
 
 from bayespbrl import load
-from bayespbrl.trials import COLUMNS, collect, run_trials
+from bayespbrl import trials as trials_module
+from bayespbrl.rollouts import returns
+from bayespbrl.trial_tables import COLUMNS, collect
+from bayespbrl.trials import run_trials
 
 QUICK = {"utility": "linear-program", "iterations": 2}
 
@@ -77,8 +83,6 @@ def test_a_trial_in_a_process_of_its_own_is_the_run_of_its_seed(study, tmp_path)
 
 
 def test_a_second_call_keeps_finished_trials_and_goes_on_with_unfinished_ones(study):
-    import shutil
-
     finished, stopped = study.path / "seed-5", study.path / "seed-6"
     before = {file: file.stat().st_mtime_ns for file in finished.rglob("*") if file.is_file()}
     values = study.table["value"].values
@@ -96,7 +100,92 @@ def test_a_directory_with_other_settings_is_refused(study):
         run_trials("gridworld", study.path, trials=2, seed=5, **(QUICK | {"iterations": 3}))
 
 
-@pytest.mark.parametrize("changes", [{"trials": 0}, {"jobs": 0}, {"expert": "terminal"}, {"kl_bound": -1.0}])
+# A single step from the centre of the grid often brings three times the same reward: in seeds 6 and 7 the first answers
+# are both ties, in 5, 8 and 9 they are not.
+TIED = QUICK | {"max_steps": 1, "evaluation_episodes": 2, "seed": 5, "preference_within": 1}
+
+
+@pytest.fixture(scope="module")
+def redrawn(tmp_path_factory):
+    return run_trials("gridworld", tmp_path_factory.mktemp("redrawn"), trials=3, jobs=2, **TIED)
+
+
+def test_a_trial_that_meets_no_preference_is_left_and_the_next_unused_seed_takes_its_place(redrawn):
+    assert redrawn.table["seed"].values.tolist() == [5, 8, 9]
+    assert redrawn.table.attrs["redraws"] == 2
+    assert redrawn.table.attrs["redrawn_seeds"] == "6 7"
+    assert (redrawn.table["pairs"].values > 0).all()
+    for seed in (6, 7):
+        left = load(redrawn.path / f"seed-{seed}")
+        assert len(left.iterations) == 1
+        assert left.preferences.pairs == ()
+    stored = xr.load_dataset(redrawn.path / "trials.nc", engine="h5netcdf")
+    assert stored.attrs["redraws"] == 2
+    with (redrawn.path / "trials.csv").open() as file:
+        assert {row["seed"] for row in csv.DictReader(file)} == {"5", "8", "9"}
+
+
+def test_a_second_call_redraws_nothing_again_and_a_lost_trial_comes_back(redrawn):
+    before = {file: file.stat().st_mtime_ns for file in redrawn.path.rglob("seed-[5679]/**/*") if file.is_file()}
+    values = redrawn.table["value"].values
+    shutil.rmtree(redrawn.path / "seed-8")
+    finished = []
+    again = run_trials("gridworld", redrawn.path, trials=3, progress=finished.append, **TIED)
+    assert finished == [8]
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+    np.testing.assert_array_equal(again.table["value"].values, values)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4, 5], [2, 1, 0, 3, 5, 4], [1, 0, 2, 4, 3, 5]])
+def test_the_seeds_of_a_study_do_not_depend_on_which_trial_ends_first(order):
+    outcomes = {10: True, 11: False, 12: False, 13: False, 14: True, 15: True, 16: True}
+    study = SimpleNamespace(settings=SimpleNamespace(seed=10), outcome=lambda seed: None, preference_within=3)
+    seeds = trials_module._Seeds(study, trials=3)
+    while to_do := seeds.to_do():
+        seed = next(10 + place for place in order if 10 + place in to_do)
+        seeds.outcomes[seed] = outcomes[seed]
+    assert seeds.with_outcome(True) == [10, 14, 15]
+    assert seeds.with_outcome(False) == [11, 12, 13]
+
+
+def test_a_study_that_hardly_ever_meets_a_preference_gives_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(trials_module, "MOST_SEEDS_A_TRIAL", 2)
+    with pytest.raises(ValueError, match="2 of 2 trials met no preference within 1 iterations: expected 1 that do"):
+        run_trials("gridworld", tmp_path, trials=1, **(TIED | {"seed": 6}))
+
+
+def test_only_the_acrobot_needs_a_preference_and_within_three_iterations(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(trials_module, "_in_parallel", lambda seeds, jobs, progress: seen.append(seeds.study))
+    for env in ("acrobot", "bayespbrl/Acrobot-v0", "gridworld", "CartPole-v1"):
+        with pytest.raises(IndexError):  # no run has left a summary
+            run_trials(env, tmp_path, trials=1)
+    assert [study.preference_within for study in seen] == [3, 3, None, None]
+
+
+@pytest.mark.slow
+def test_bicycle_trials_tell_survival_and_balancing_time(tmp_path):
+    options = {"utility": "linear-program", "iterations": 2, "centres": 20, "evaluation_episodes": 10, "seed": 1}
+    study = run_trials("bicycle", tmp_path, trials=1, policy="linear-gaussian", **options)
+    run = load(tmp_path / "seed-1")
+    last = returns("bicycle", run.learner.policy, key=jax.random.key(1), episodes=100, max_steps=3000)
+    steps = study.table["balancing_steps"]
+    assert steps.values.tolist() == [last.steps.mean()]
+    assert steps.attrs == {"max_steps": 3000, "episodes": 100}
+    with (tmp_path / "trials.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert float(second["survival"]) == pytest.approx(1 - run.iterations[-1]["terminated"])
+    assert float(second["balancing_steps"]) == last.steps.mean()
+    assert float(second["balancing_seconds"]) == pytest.approx(0.01 * last.steps.mean())
+    assert (first["balancing_steps"], first["balancing_seconds"]) == ("", "")
+    (tmp_path / "seed-1" / "balancing.json").unlink()  # as if killed before it was measured
+    again = run_trials("bicycle", tmp_path, trials=1, policy="linear-gaussian", **options)
+    np.testing.assert_array_equal(again.table["balancing_steps"], steps)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"trials": 0}, {"jobs": 0}, {"preference_within": 0}, {"expert": "terminal"}, {"kl_bound": -1.0}]
+)
 def test_bad_input_is_named_and_nothing_is_left(tmp_path, changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         run_trials("gridworld", tmp_path / "study", **({"trials": 1} | changes))

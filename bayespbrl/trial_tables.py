@@ -1,0 +1,110 @@
+"""What many trials gave, as tables: the summaries of their iterations, and how long the final policies last."""
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from bayespbrl import rollouts, runs
+from bayespbrl.cycle import Learner
+from bayespbrl.envs import bicycle
+
+COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value")
+
+# Environments in which lasting is the task, and the most steps that an episode of the final policy may take.
+BALANCING_STEPS = {"bayespbrl/Bicycle-v0": 3000}
+BALANCING_COLUMNS = ("survival", "balancing_steps", "balancing_seconds")
+BALANCING_FILE = "balancing.json"
+
+
+def collect(directories: Sequence[Path | str]) -> xr.Dataset:
+    """The summaries of finished runs as one data set over (seed, iteration).
+
+    Numbers and lists of numbers are kept, the latter with a dimension of their own; what is missing is NaN.
+    """
+    summaries = [runs.read_summary(path) for path in directories]
+    seeds = [summary["seed"] for summary in summaries]
+    iterations = [entry["iteration"] for entry in summaries[0]["iterations"]]
+    variables: dict[str, Any] = {}
+    for name in summaries[0]["iterations"][0]:
+        values = [[entry.get(name) for entry in summary["iterations"]] for summary in summaries]
+        if name != "iteration" and (figures := _figures(values)) is not None:
+            variables[name] = (("seed", "iteration", f"{name}_dimension")[: figures.ndim], figures)
+    if all(has_balancing(path) for path in directories):
+        lasted = [json.loads((Path(path) / BALANCING_FILE).read_text()) for path in directories]
+        limits = {name: lasted[0][name] for name in ("max_steps", "episodes")}
+        variables["balancing_steps"] = ("seed", np.array([entry["mean_steps"] for entry in lasted]), limits)
+    attributes = {"env": summaries[0]["env"], "utility": summaries[0]["utility"]}
+    return xr.Dataset(variables, {"seed": seeds, "iteration": iterations}, attributes)
+
+
+def _figures(values: Sequence[Sequence[Any]]) -> np.ndarray | None:
+    """Numbers, or lists of numbers that are all as long, as one array; None for anything else."""
+    flat = [value for row in values for value in row if value is not None]
+    lengths = {len(value) if isinstance(value, list) else 0 for value in flat}
+    if len(lengths) > 1 or any(isinstance(value, str | dict) for value in flat):
+        return None
+    missing = [np.nan] * length if (length := max(lengths, default=0)) else np.nan
+    return np.array([[missing if value is None else value for value in row] for row in values])
+
+
+def has_balancing(directory: Path | str) -> bool:
+    """Whether `measure_balancing` has left its file in a run directory."""
+    return (Path(directory) / BALANCING_FILE).exists()
+
+
+def measure_balancing(learner: Learner, directory: Path, *, max_steps: int, episodes: int = 100) -> None:
+    """How many steps a learner's final policy lasts before a terminal state, in fresh episodes; into `balancing.json`.
+
+    An episode that reaches `max_steps` counts as that many.
+    """
+    key = jax.random.key(learner.settings.seed)
+    lasted = rollouts.returns(learner.environment, learner.policy, key=key, episodes=episodes, max_steps=max_steps)
+    content = {
+        "episodes": episodes,
+        "max_steps": max_steps,
+        "mean_steps": float(lasted.steps.mean()),
+        "terminated": float(lasted.terminated.mean()),
+    }
+    aside = directory / f"{BALANCING_FILE}.part"
+    aside.write_text(json.dumps(content, indent=1) + "\n")
+    aside.replace(directory / BALANCING_FILE)
+
+
+def write_tables(table: xr.Dataset, directory: Path) -> None:
+    """`trials.csv`, one row a trial and iteration, and `trials.nc`, both renamed into place.
+
+    Where lasting is the task, the share of evaluation episodes that survive is a column more, and the balancing time
+    of the final policy two more, filled in the row of the last iteration.
+    """
+    aside = directory / "trials.csv.part"
+    balancing = "balancing_steps" in table
+    last = table["iteration"].values[-1]
+    with aside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS + (BALANCING_COLUMNS if balancing else ()))
+        for number in table["seed"].values:
+            for iteration in table["iteration"].values:
+                cell = table.sel(seed=number, iteration=iteration)
+                answers, value = int(cell["answers"]), float(cell["value"])
+                row = [table.attrs["env"], table.attrs["utility"], number, iteration, answers, value]
+                if balancing:
+                    row += [
+                        f"{1 - float(cell['terminated']):g}",
+                        *(_balancing(cell) if iteration == last else ("", "")),
+                    ]
+                writer.writerow(row)
+    aside.replace(directory / "trials.csv")
+    aside = directory / "trials.nc.part"
+    table.to_netcdf(aside, engine="h5netcdf")
+    aside.replace(directory / "trials.nc")
+
+
+def _balancing(cell: xr.Dataset) -> tuple[float, float]:
+    steps = float(cell["balancing_steps"])
+    return steps, round(steps * bicycle.STEP_SECONDS, 6)
