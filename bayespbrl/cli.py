@@ -163,7 +163,18 @@ def _carry_on(learner: Any) -> None:
 
     picture = directory / "run.png"
     run_figure(learner).savefig(picture, dpi=110)
-    console.print(f"Run directory: {directory}\nPicture: {picture}")
+    console.print(f"Run directory: {directory}\nPicture: {picture}\n{_film(learner, directory)}")
+
+
+def _film(learner: Any, directory: Path) -> str:
+    """Film the final policy, and say where or why not: not every environment can be rendered."""
+    from bayespbrl.film import film_policy
+
+    try:
+        film, strip = film_policy(learner, directory)
+    except ValueError as error:
+        return f"No film of the final policy: {error}"
+    return f"Final policy: {film} and {strip}"
 
 
 def _run_with_bar(learner: Any) -> None:

@@ -32,6 +32,7 @@ GROUPS = {
     "diagnostics": ["diagnostics"],
     "report": ["diagnostics.report"],
     "trials": ["trials", "trial_tables"],
+    "film": ["film"],
     "command line": ["cli", "__main__"],
 }
 GROUND = ["numerics", "convergence", "environments"]
@@ -54,7 +55,8 @@ ALLOWED = {
     "diagnostics": [*LEARNED, "trials"],
     "report": [*LEARNED, "diagnostics", "trials"],
     "trials": LEARNED,
-    "command line": [*LEARNED, "diagnostics", "report", "trials"],
+    "film": LEARNED,
+    "command line": [*LEARNED, "diagnostics", "report", "trials", "film"],
 }
 # These import each other.
 WITHIN = {"environments", "models", "policies", "what flows round", "diagnostics", "trials", "command line"}

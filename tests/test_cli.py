@@ -3,10 +3,15 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
+from unittest import mock
 
+import numpy as np
 import pytest
+import xarray as xr
 
-from bayespbrl.cli import main
+from bayespbrl.cli import _print_trials, main
+from bayespbrl.trials import Trials
 
 QUICK = ["--utility", "linear-program", "--iterations", "2"]
 
@@ -35,7 +40,34 @@ def test_run_leaves_a_run_directory_with_a_picture_and_says_where(monkeypatch, c
     assert "answers" in shown
     assert re.sub(r"\s", "", str(out)) in re.sub(r"\s", "", shown)
     assert (out / "run.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "final.gif").read_bytes().startswith(b"GIF")
+    assert (out / "final.png").read_bytes().startswith(b"\x89PNG")
     assert [entry["answers"] for entry in json.loads((out / "summary.json").read_text())["iterations"]] == [2, 3]
+
+
+def test_a_run_in_an_environment_that_cannot_be_rendered_finishes_and_says_so(monkeypatch, capsys, tmp_path):
+    out = tmp_path / "run"
+    options = ["--utility", "linear-program", "--iterations", "1", "--max-steps", "5", "--centres", "10"]
+    with mock.patch.dict(sys.modules, {"pygame": None}):  # with which gymnasium renders it
+        assert call(monkeypatch, "run", "CartPole-v1", *options, "--out", out) == 0
+    assert "No film of the final policy: environment CartPole-v1 cannot be rendered" in capsys.readouterr().out
+    assert not (out / "final.gif").exists()
+
+
+def test_trials_tell_redraws_and_how_long_the_final_policies_last(capsys):
+    names = ["answers", "value", "bound_active", "kl", "kl_bound", "feature_gap", "feature_gap_raw", "rank_kept"]
+    table = xr.Dataset(
+        {name: (("seed", "iteration"), np.ones((2, 1))) for name in [*names, "utility_converged"]},
+        {"seed": [1, 3], "iteration": [1]},
+        {"env": "bicycle", "utility": "posterior-mean", "redraws": 2, "redrawn_seeds": "2 4"},
+    )
+    table["terminated"] = ("seed", "iteration"), np.array([[0.0], [0.25]])
+    table["balancing_steps"] = "seed", np.array([100.0, 300.0]), {"max_steps": 3000, "episodes": 100}
+    _print_trials(Trials(table, Path("study")))
+    shown = capsys.readouterr().out
+    assert "Redrawn for want of a preference: 2 trials, seeds 2, 4." in shown
+    assert "87.5% of the evaluation episodes survive (worst trial 75.0%)" in shown
+    assert "200 steps in the median trial, 100 in the worst, of 3000 at most" in shown
 
 
 def test_options_reach_the_settings(monkeypatch, tmp_path):

@@ -5,10 +5,12 @@ observations are drawn against time. No hidden reward is shown.
 """
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from bayespbrl.envs.functional import picture
 from bayespbrl.envs.opening import open_environment
@@ -51,25 +53,51 @@ def frames(environment: Any, trajectory: Any, *, max_frames: int = MAX_FRAMES) -
     draw = getattr(_dynamics(environment), "draw", None)
     if draw is None:
         return picture(lambda axes: draw_trajectory(environment, trajectory, axes))[None]
-    shown = _shown(trajectory, max_frames)
+    shown = _spread(len(trajectory.states), max_frames)
     return np.stack([picture(lambda axes, index=index: draw(trajectory.states[index], axes)) for index in shown])
 
 
 def film(environment: Any, trajectory: Any, path: str | os.PathLike[str], *, max_frames: int = MAX_FRAMES) -> Path:
     """Write `frames` as an animated GIF, at the speed the dynamics state (`frames_per_second`, 10 by default)."""
-    from PIL import Image
-
-    pictures = [Image.fromarray(frame) for frame in frames(environment, trajectory, max_frames=max_frames)]
+    pictures = frames(environment, trajectory, max_frames=max_frames)
     stride = len(trajectory.states) / len(pictures)
     rate = getattr(_dynamics(environment), "frames_per_second", 10.0)
-    milliseconds = [max(20, round(1000 * stride / rate))] * (len(pictures) - 1) + [1500]  # rest on the last picture
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=milliseconds, loop=0, format="GIF")
+    return animation(pictures, path, milliseconds=1000 * stride / rate)
+
+
+def drawing(environment: Any, trajectory: Any, path: str | os.PathLike[str]) -> Path:
+    """Write `draw_trajectory` as a PNG."""
+    Image.fromarray(picture(partial(draw_trajectory, environment, trajectory), inches=(9.0, 7.0))).save(path, "PNG")
     return Path(path)
 
 
-def _shown(trajectory: Any, max_frames: int) -> np.ndarray:
-    states = len(trajectory.states)
-    return np.unique(np.linspace(0, states - 1, min(states, max_frames)).round().astype(int))
+def animation(frames: np.ndarray, path: str | os.PathLike[str], *, milliseconds: float) -> Path:
+    """Write pictures, shape (F, height, width, 3) uint8, as a GIF that rests on the last.
+
+    `milliseconds` is how long each is shown, at least 20 (what viewers manage).
+    """
+    images = [Image.fromarray(frame) for frame in frames]
+    durations = [max(20, round(milliseconds))] * (len(images) - 1) + [1500]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, format="GIF")
+    return Path(path)
+
+
+def contact_sheet(frames: np.ndarray, path: str | os.PathLike[str], *, most: int = 12, columns: int = 6) -> Path:
+    """Write at most `most` of the pictures, evenly spread, as one PNG, row by row."""
+    shown = frames[_spread(len(frames), most)]
+    rows = -(-len(shown) // columns)
+    height, width = shown.shape[1:3]
+    sheet = np.full((rows * height, min(columns, len(shown)) * width, 3), 255, dtype=np.uint8)
+    for place, frame in enumerate(shown):
+        row, column = divmod(place, columns)
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = frame
+    Image.fromarray(sheet).save(path, "PNG")
+    return Path(path)
+
+
+def _spread(number: int, most: int) -> np.ndarray:
+    """At most `most` of the indices below `number`, evenly spread, first and last among them."""
+    return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(int))
 
 
 def _dynamics(environment: Any) -> Any:

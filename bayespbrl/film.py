@@ -1,0 +1,91 @@
+"""A policy at work: one fresh episode as an animated GIF and as a film strip."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+
+from bayespbrl import rollouts
+from bayespbrl.cycle import Learner
+from bayespbrl.envs import pictures
+from bayespbrl.envs.opening import environment_name, flattened, made_from
+from bayespbrl.policies.actor import Actor
+
+FRAMES = 60  # of the GIF, at most twice as many
+
+
+def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tuple[Path, Path]:
+    """Write `final.gif` and `final.png`, the film and the film strip of one episode under the learner's policy.
+
+    An environment whose dynamics can `draw` is drawn; any other one renders itself, in its mode `rgb_array`.
+
+    Raises:
+      ValueError: an environment that cannot be rendered, or fails at it.
+    """
+    film, strip = directory / f"{name}.gif", directory / f"{name}.png"
+    environment, settings = learner.environment, learner.settings
+    try:
+        if hasattr(getattr(environment.unwrapped, "dynamics", None), "draw"):
+            shown = rollouts.rollout(
+                environment,
+                learner.policy,
+                key=jax.random.key(settings.seed),
+                episodes=settings.trajectories_per_iteration,  # another number would be compiled anew
+                max_steps=settings.max_steps,
+            )[0]
+            pictures.film(environment, shown, film, max_frames=FRAMES)
+            pictures.drawing(environment, shown, strip)
+        else:
+            frames, milliseconds = _rendered(learner)
+            pictures.animation(frames, film, milliseconds=milliseconds)
+            pictures.contact_sheet(frames, strip)
+    except Exception as error:  # whatever a drawing or rendering of the user's raises
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"environment {environment_name(environment)} cannot be rendered: {reason}") from error
+    return film, strip
+
+
+def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
+    """Pictures of one episode by the environment itself, and for how many milliseconds to show each."""
+    env, settings = _rendering(learner.environment), learner.settings
+    limit = rollouts.step_limit(learner.environment, settings.max_steps)
+    actor = Actor(learner.policy, env.action_space, np.random.default_rng(settings.seed))
+    stride = 1
+    try:
+        observation, _ = env.reset(seed=settings.seed)
+        frames = [_frame(env)]
+        for step in range(1, limit + 1):
+            observation, _, terminated, truncated, _ = env.step(actor.act(observation))
+            ended = terminated or truncated or step == limit
+            if ended or step % stride == 0:
+                frames.append(_frame(env))
+            if ended:
+                break
+            if len(frames) == 2 * FRAMES:  # an episode of any length in bounded memory
+                frames, stride = frames[::2], 2 * stride
+    finally:
+        if env is not learner.environment:
+            env.close()
+    return np.stack(frames), 1000 * stride / float(env.metadata.get("render_fps") or 10)
+
+
+def _rendering(environment: gymnasium.Env) -> gymnasium.Env:
+    """The environment in a mode that renders: made again where its id was given, else the user's own object."""
+    spec = made_from(environment)
+    if spec is None:
+        if environment.render_mode != "rgb_array":
+            raise ValueError(f"expected render_mode rgb_array, got {environment.render_mode}")
+        return environment
+    modes = environment.metadata.get("render_modes") or ()
+    if "rgb_array" not in modes:
+        raise ValueError(f"expected a mode rgb_array, got {', '.join(modes) or 'none'}")
+    return flattened(gymnasium.make(spec, render_mode="rgb_array"))
+
+
+def _frame(env: gymnasium.Env) -> np.ndarray:
+    frame: Any = np.asarray(env.render())
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise ValueError(f"expected a picture of shape (height, width, 3) in uint8, got {frame.shape} in {frame.dtype}")
+    return frame
