@@ -34,6 +34,7 @@ from bayespbrl.utility import LinearUtility
 FORMAT = 1
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Any = "h5netcdf"
+PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "policy", "estimate")}
 
 
 def start(
@@ -155,6 +156,12 @@ class Run:
             ).total.mean()
         )
 
+    def report(self, format: str = "html") -> Path:
+        """Write the diagnostic report into the run directory, as `report.html` or `report.md`, and return its path."""
+        from bayespbrl.diagnostics.report import write_report  # stands above this module, and reads with it
+
+        return write_report(self.path, format=format, env=self.learner.environment, features=self.learner.features)
+
 
 class RunDirectory:
     """The log of a run (see the module's first lines). Made by `create` or `open`."""
@@ -211,7 +218,7 @@ class RunDirectory:
     def append(self, entry: Entry, state: LearnerState) -> None:
         """Keep one event: first its heavy parts, then its line, flushed to the disk."""
         if entry.parts:
-            write_iteration(self._iteration(entry.event["iteration"]), entry)
+            write_iteration(self.iteration_file(entry.event["iteration"]), entry)
         line = (json.dumps(dict(entry.event), allow_nan=False) + "\n").encode()
         with (self.path / "events.jsonl").open("ab", buffering=0) as file:
             before = file.tell()
@@ -235,7 +242,7 @@ class RunDirectory:
             parts = {}
             if event["event"] in ("collected", "improved"):
                 parts = read_iteration(
-                    self._iteration(event["iteration"]), event["event"], features=features, known=known
+                    self.iteration_file(event["iteration"]), event["event"], features=features, known=known
                 )
             yield Entry(event, parts)
 
@@ -272,7 +279,8 @@ class RunDirectory:
         except UnicodeDecodeError as error:
             raise ValueError(f"events.jsonl: expected lines of JSON, got {error}") from error
 
-    def _iteration(self, number: int) -> Path:
+    def iteration_file(self, number: int) -> Path:
+        """Where the heavy parts of an iteration are kept."""
         return self.path / "iterations" / f"{number:04d}.nc"
 
     def write_summary(self, state: LearnerState) -> None:
@@ -327,13 +335,20 @@ def write_iteration(file: Path, entry: Entry) -> None:
 
 def read_iteration(file: Path, event: str, *, features: Any = None, known: Sequence[type] = ()) -> dict[str, Any]:
     """The parts that `event`, `collected` or `improved`, brought; `ValueError` for a truncated or foreign file."""
+    return read_parts(file, PARTS[event], features=features, known=known)
+
+
+def read_parts(file: Path, names: Sequence[str], *, features: Any = None, known: Sequence[type] = ()) -> dict[str, Any]:
+    """Some of the `trajectories`, `policy` and `estimate` of an iteration; errors as of `read_iteration`."""
+    read = {
+        "trajectories": lambda tree: _read_trajectories(tree.children["trajectories"].to_dataset()),
+        "policy": lambda tree: records.from_tree(tree.children["policy"], known=known),
+        "estimate": lambda tree: _read_estimate(tree, features, known),
+    }
     try:
         with xr.open_datatree(file, engine=ENGINE) as opened:
             tree = opened.load()
-        parts: dict[str, Any] = {"trajectories": _read_trajectories(tree.children["trajectories"].to_dataset())}
-        if event == "improved":
-            parts["policy"] = records.from_tree(tree.children["policy"], known=known)
-            parts["estimate"] = _read_estimate(tree, features, known)
+        parts = {name: read[name](tree) for name in names}
     except (OSError, KeyError, RuntimeError, AttributeError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{file.name}: expected the netCDF file of an iteration, got {reason}") from error

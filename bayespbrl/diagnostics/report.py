@@ -1,0 +1,140 @@
+"""The diagnostic report of a run: one self-contained file that a person reads from top to bottom."""
+
+from collections.abc import Callable
+from datetime import datetime
+from importlib.metadata import version
+from importlib.resources import files
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+
+from bayespbrl.diagnostics import (
+    report_answers,
+    report_findings,
+    report_sections,
+    report_tables,
+    report_utility,
+    report_warnings,
+)
+from bayespbrl.diagnostics.report_document import Comparison, Picture, Section
+from bayespbrl.diagnostics.report_evidence import Evidence, read_evidence
+
+FORMATS = ("html", "md")
+
+
+def write_report(directory: Path | str, *, format: str = "html", env: Any = None, features: Any = None) -> Path:
+    """Write the report of a run into its directory; nothing else there is changed.
+
+    Args:
+      directory: of a run: finished, in progress, or with files that cannot be read, which the report then says.
+      format: `html`, one file with its pictures in it, `report.html`; or `md`, `report.md` with its pictures in
+        `report_files/`.
+      env, features: what the run was started with, where these were objects of the user's; what needs them is left out,
+        and said to be, without them.
+
+    Returns:
+      the path of the file.
+
+    Raises:
+      ValueError: a format there is not; a directory that is no run, is one of a newer version, or cannot be written.
+    """
+    if format not in FORMATS:
+        raise ValueError(f"format: expected {' or '.join(FORMATS)}, got {format!r}")
+    content = assembled(read_evidence(directory, env=env, features=features))
+    template = files("bayespbrl.diagnostics").joinpath(f"report.{format}.jinja").read_text(encoding="utf-8")
+    # what comes from a run (names, messages) is text and never markup
+    engine = Environment(autoescape=format == "html", undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    engine.filters["groupby_adjacent"] = lambda blocks: [
+        (kind, list(group)) for kind, group in groupby(blocks, key=attrgetter("kind"))
+    ]
+    engine.filters["cell"] = lambda text: str(text).replace("|", "\\|").replace("\n", " ")
+    path = Path(directory) / f"report.{format}"
+    try:
+        if format == "md":
+            _write_pictures(Path(directory) / "report_files", content["sections"])
+        aside = path.with_name(path.name + ".part")
+        aside.write_text(engine.from_string(template).render(**content), encoding="utf-8")
+        aside.replace(path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot write the report there ({error})") from error
+    return path
+
+
+def assembled(evidence: Evidence) -> dict[str, Any]:
+    """Everything that the templates name: facts, sentences, warnings and sections."""
+    iterations = report_tables.iterations_table(evidence.iterations)
+    answers = report_tables.answers_table(evidence)
+    scores = report_tables.prequential_table(evidence)
+    failures: list[report_warnings.Warning] = []
+    parts: list[tuple[str, Callable[[], Section]]] = [
+        ("Learning curve", lambda: report_sections.learning(evidence, iterations)),
+        ("Have the fits converged?", lambda: report_sections.fits(evidence, iterations)),
+        ("What it thinks is good", lambda: report_utility.utility(evidence)),
+        ("The answers", lambda: report_answers.answers(evidence, answers)),
+        ("Are its probabilities right?", lambda: report_sections.calibration(evidence, scores)),
+        ("The policy updates", lambda: report_sections.updates(evidence, iterations)),
+        ("How much leans on σ and m", lambda: report_sections.leaning(evidence)),
+        ("All iterations in figures", lambda: report_sections.numbers(iterations)),
+    ]
+    sections = [_built(title, build, failures) for title, build in parts]
+    return {
+        "title": f"{evidence.settings.env}, {evidence.settings.utility}, seed {evidence.settings.seed}",
+        "state": _state(evidence),
+        "facts": _facts(evidence),
+        "learnt": report_findings.learnt(evidence, iterations, answers, scores),
+        "warnings": report_warnings.warnings(evidence, iterations, answers, scores) + failures,
+        "sections": sections,
+        "made": f"Made by bayespbrl {version('bayespbrl')} on {datetime.now():%Y-%m-%d %H:%M} from {evidence.path}.",
+    }
+
+
+def _built(title: str, build: Callable[[], Section], failures: list[report_warnings.Warning]) -> Section:
+    """A section, or one that says why it could not be made: whatever an environment or features of the user's raise."""
+    try:
+        return build()
+    except Exception as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        failures.append(
+            report_warnings.Warning(
+                f"The section “{title}” could not be made ({reason}).", "The others are unaffected."
+            )
+        )
+        name = "".join(letter for letter in title.lower() if letter.isalpha())
+        return Section(name, title, [f"This section could not be made: {reason}."])
+
+
+def _state(evidence: Evidence) -> str:
+    done, wanted = len(evidence.iterations), evidence.settings.iterations
+    if evidence.finished:
+        return f"Finished: {done} iterations."
+    waiting = "" if evidence.waiting is None else f" Question {evidence.waiting} waits for an answer."
+    return f"In progress: {done} of {wanted} iterations.{waiting} bayespbrl resume {evidence.path} goes on."
+
+
+def _facts(evidence: Evidence) -> list[tuple[str, str]]:
+    settings = evidence.settings
+    expert = settings.expert + (f", {settings.wrong_answers:.0%} wrong" if settings.wrong_answers else "")
+    return [
+        ("likelihood", settings.likelihood),
+        ("prior scale σ", f"{settings.prior_scale:g}"),
+        ("steepness m", f"{settings.steepness:g}"),
+        ("lapse rate λ", f"{settings.lapse_rate:g}"),
+        ("KL bound ε", f"{settings.kl_bound:g}"),
+        ("discount γ", f"{settings.discount:g}"),
+        ("policy", settings.policy),
+        ("expert", expert),
+    ]
+
+
+def _write_pictures(folder: Path, sections: list[Section]) -> None:
+    folder.mkdir(exist_ok=True)
+    for section in sections:
+        for block in section.blocks:
+            pictures = (
+                block.pictures if isinstance(block, Comparison) else (block,) if isinstance(block, Picture) else ()
+            )
+            for picture in pictures:
+                (folder / f"{picture.name}.png").write_bytes(picture.png)

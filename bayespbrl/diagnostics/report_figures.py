@@ -1,0 +1,184 @@
+"""The figures of a report that no other module has. Each draws on the matplotlib axes it is given and returns them."""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+SETTLED, OPEN = "#1b6ca8", "#c2571a"
+
+
+def plot_value(table: xr.Dataset, axes: Axes, *, optimum: float | None = None) -> Axes:
+    """Value of each iteration's policy against the answers so far; the best one marked."""
+    answers, value = table["answers"].values, table["value"].values
+    axes.plot(answers, value, marker="o", markersize=3.5, color=SETTLED)
+    if np.isfinite(value).any():
+        best = int(np.nanargmax(value))
+        axes.plot(answers[best], value[best], "*", markersize=13, color=OPEN, label=f"best: {value[best]:.4g}")
+    if optimum is not None:
+        axes.axhline(optimum, color="0.4", linestyle="--", linewidth=1, label=f"optimum: {optimum:.4g}")
+    axes.set(xlabel="answers", ylabel="mean return of fresh episodes")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend()
+    return axes
+
+
+def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = 1.01) -> Axes:
+    """Largest R̂ of each iteration's fit."""
+    _series(table, axes, {"rhat_max": "largest R̂"}, converged="utility_converged")
+    axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")
+    low, high = axes.get_ylim()
+    axes.set(ylabel="R̂", ylim=(min(low, 0.9995), max(high, limit + 0.002)))
+    axes.legend()
+    return axes
+
+
+def plot_effective_sample_size(table: xr.Dataset, axes: Axes, *, limit: float = 400.0) -> Axes:
+    """Effective draws of the worst margin of each iteration's fit."""
+    _series(table, axes, {"effective_sample_size_min": "worst margin"}, converged="utility_converged")
+    axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")
+    axes.set(ylabel="effective draws", ylim=(0, None))
+    axes.legend()
+    return axes
+
+
+def plot_bound(table: xr.Dataset, axes: Axes) -> Axes:
+    """The KL bound, the KL that REPS reached and that of the policy fitted to it, on a logarithmic scale."""
+    names = {"kl_bound": "bound", "kl": "reached by REPS", "kl_fitted_policy": "fitted policy"}
+    values = np.concatenate([table[name].values for name in names])
+    positive = values[np.isfinite(values) & (values > 0)]
+    lowest = max(1e-6, positive.min() / 2) if positive.size else 1e-6
+    _series(table.assign({name: np.maximum(table[name], lowest) for name in names}), axes, names)
+    axes.set(ylabel="KL to the policy before (nats)", yscale="log")
+    axes.legend()
+    return axes
+
+
+def plot_temperature(table: xr.Dataset, axes: Axes) -> Axes:
+    """REPS's temperature on a logarithmic scale; updates whose solver did not meet its tolerance are marked."""
+    _series(table, axes, {"temperature": "temperature"}, converged="reps_converged")
+    if np.nanmin(table["temperature"].values, initial=np.inf) > 0:
+        axes.set_yscale("log")
+    axes.set(ylabel="temperature (utility)")
+    return axes
+
+
+def plot_entropy(table: xr.Dataset, axes: Axes) -> Axes:
+    """Mean entropy of each iteration's policy over the visited states, and its action noise where that is known."""
+    _series(table, axes, {"entropy": "entropy"})
+    axes.set(ylabel="entropy (nats)")
+    spread = table["action_standard_deviation"].values
+    if np.isfinite(spread).any():
+        other = axes.twinx()
+        other.plot(table["iteration"], spread, "s--", markersize=3, color=OPEN, label="standard deviation")
+        other.set(ylabel="standard deviation of the action", ylim=(0, None))
+        other.legend(loc="lower left")
+    return axes
+
+
+def plot_column(table: xr.Dataset, name: str, axes: Axes) -> Axes:
+    """Any one number of each iteration."""
+    _series(table, axes, {name: name})
+    axes.set(ylabel=name)
+    return axes
+
+
+def plot_states(table: xr.Dataset, values: np.ndarray, axes: Axes, *, label: str, **limits: Any) -> Axes:
+    """One number of each state: a map, a line, or coloured points, by the `kind` of a `utility_table`.
+
+    Args:
+      table: what `utility_table` returned.
+      values: shape (state,); NaN stays blank.
+      axes: to draw on.
+      label: what the numbers are.
+      **limits: `vmin`, `vmax` and `cmap` of the colours.
+    """
+    kind, states = table.attrs["kind"], table["states"].values
+    axes.set_facecolor("0.9")
+    if kind == "list":
+        axes.bar(states, values, color=SETTLED)
+        axes.set(xlabel="state", ylabel=label)
+        return axes
+    if kind == "line":
+        axes.plot(states[:, 0], values, color=SETTLED)
+        axes.set(xlabel="observation 0", ylabel=label)
+        return axes
+    if kind == "grid":
+        rows, columns = table.attrs["shape"]
+        image: Any = axes.imshow(values.reshape(rows, columns), **limits)
+        axes.set_xticks(range(columns), [str(j + 1) for j in range(columns)])
+        axes.set_yticks(range(rows), [str(i + 1) for i in range(rows)])
+        axes.set(xlabel="column", ylabel="row")
+    elif kind == "plane":
+        x, y = (states[:, d].reshape(table.attrs["shape"]) for d in (0, 1))
+        image = axes.pcolormesh(x, y, values.reshape(table.attrs["shape"]), shading="auto", rasterized=True, **limits)
+        axes.set(xlabel="observation 0", ylabel="observation 1")
+    else:
+        first, second = table.attrs["dimensions"]
+        image = axes.scatter(
+            states[:, first], states[:, second], c=values, s=5, linewidths=0, rasterized=True, **limits
+        )
+        axes.set(xlabel=f"observation {first}", ylabel=f"observation {second}")
+    axes.figure.colorbar(image, ax=axes, shrink=0.85, label=label)
+    return axes
+
+
+def plot_state_bands(table: xr.Dataset, axes: Axes) -> Axes:
+    """Mean utility of each state with two standard deviations either way: of states in a list or on a line."""
+    states, mean = table["states"].values.reshape(table.sizes["state"]), table["mean"].values
+    sd = table["sd"].values if "sd" in table else np.zeros(len(mean))
+    if table.attrs["kind"] == "line":
+        axes.fill_between(states, mean - 2 * sd, mean + 2 * sd, alpha=0.25, linewidth=0, label="± 2 sd")
+        axes.plot(states, mean, color=SETTLED, label="mean")
+        axes.set(xlabel="observation 0", ylabel="utility")
+    else:
+        axes.errorbar(states, mean, yerr=2 * sd, fmt="o", markersize=4, capsize=2, color=SETTLED, label="mean ± 2 sd")
+        axes.set(xlabel="state", ylabel="utility")
+    axes.axhline(0, color="0.6", linewidth=0.8)
+    axes.legend()
+    return axes
+
+
+def plot_trajectories(table: xr.Dataset, axes: Axes) -> Axes:
+    """Inferred utility of the trajectories that were asked about, with 90 % intervals, against their hidden return."""
+    x, y = table["hidden_return"].values, table["utility"].values
+    if "lower" in table:
+        reach = np.abs(np.stack([y - table["lower"].values, table["upper"].values - y]))
+        axes.errorbar(x, y, yerr=reach, fmt="none", ecolor="0.7", elinewidth=1, label="90 % interval")
+    axes.plot(x, y, "o", markersize=4, color=SETTLED)
+    axes.set(xlabel="hidden return (the learner never sees it)", ylabel="inferred utility")
+    if "lower" in table:
+        axes.legend()
+    return axes
+
+
+def plot_answers(table: xr.Dataset, axes: Axes) -> Axes:
+    """Probability of each answer that was given: before it was, and by the last posterior."""
+    question = table["question"].values
+    after, before = table["probability"].values, table["before"].values
+    axes.vlines(question, np.fmin(before, after), np.fmax(before, after), color="0.8", linewidth=1)
+    axes.plot(question, before, "o", fillstyle="none", markersize=5, color="0.4", label="before it was given")
+    axes.plot(question, after, "o", markersize=4, color=SETTLED, label="given all answers")
+    wrong = after < 0.5
+    if wrong.any():
+        axes.plot(question[wrong], after[wrong], "o", markersize=6, color=OPEN, label="improbable to the end")
+    axes.axhline(0.5, color="0.4", linestyle="--", linewidth=1)
+    axes.set(xlabel="question", ylabel="probability of the answer given", ylim=(-0.03, 1.03))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False)
+    return axes
+
+
+def _series(table: xr.Dataset, axes: Axes, names: dict[str, str], *, converged: str | None = None) -> None:
+    iterations = table["iteration"].values
+    for number, (name, label) in enumerate(names.items()):
+        style = "--" if number == 0 and len(names) > 1 else "-"
+        axes.plot(iterations, table[name], style, marker="o", markersize=3.5, color=f"C{number}", label=label)
+        if converged is not None and (failed := table[converged].values == 0).any():
+            at = table[name].values[failed]
+            axes.plot(iterations[failed], at, "x", markersize=9, color=OPEN, label="not converged")
+    axes.set_xlabel("iteration")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -1,0 +1,83 @@
+"""The section of a report on the utility: over the states with its uncertainty, and of what was compared."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from bayespbrl.diagnostics import report_figures as figures
+from bayespbrl.diagnostics.report_document import Picture, Section, drawn
+from bayespbrl.diagnostics.report_evidence import Evidence
+from bayespbrl.diagnostics.report_findings import no_posterior, percent
+from bayespbrl.diagnostics.report_tables import trajectories_table, utility_table
+
+
+def utility(evidence: Evidence) -> Section:
+    """The utility with its uncertainty over the states, and of the trajectories that were compared."""
+    title = "What it thinks is good"
+    if evidence.estimate is None:
+        return Section("utility", title, ["No utility estimate yet."])
+    if evidence.features_missing:
+        return Section("utility", title, ["The features φ are a function of your own that was not passed again."])
+    blocks: list[Any] = []
+    text = [] if evidence.posterior is not None else [no_posterior(evidence)]
+    if hasattr(evidence.estimate, "utilities"):
+        table = utility_table(evidence)
+        blocks += _maps(table)
+        if "sd" in table:
+            inside = table["reached"].values
+            left = table["sd"].values[inside] / table["prior_sd"].values[inside]
+            text.append(
+                f"Of the prior's standard deviation {percent(np.median(left))} is left in the median over the states "
+                f"shown, and {percent(left.min())} where most was learnt: answers tell whole trajectories apart, and "
+                "say less of single states."
+            )
+    compared = trajectories_table(evidence)
+    if compared.sizes["trajectory"] and np.ptp(compared["hidden_return"].values) > 0:
+        caption = (
+            "Every trajectory that was asked about. The interval is the posterior's for the utility of the whole; a "
+            "rising cloud says that the utility orders trajectories as the hidden return does. The scale is free."
+        )
+        panels = [("Trajectories", partial(figures.plot_trajectories, compared))]
+        alt = f"Inferred utility against hidden return of {compared.sizes['trajectory']} trajectories."
+        blocks.append(drawn("trajectories", panels, caption, alt, columns=1, size=(6.0, 3.3)))
+    return Section("utility", title, text, blocks)
+
+
+def _maps(table: xr.Dataset) -> list[Picture]:
+    kind = table.attrs["kind"]
+    where = {
+        "grid": "over the cells of the grid",
+        "list": "of every state",
+        "line": "along what was observed",
+        "plane": "over the range of what was observed",
+        "cloud": "at observed states, along the two dimensions that they fill best",
+    }[kind]
+    if kind in ("list", "line"):
+        panels: list[Any] = [("Utility of the states", partial(figures.plot_state_bands, table))]
+        caption = f"Utility {where}: mean, and two posterior standard deviations either way. The scale is free."
+        return [drawn("utility", panels, caption, f"Utility {where}.", columns=1, size=(7.6, 3.2))]
+    blank = np.where(table["reached"].values, 0.0, np.nan)
+    mean = table["mean"].values + blank
+    panels = [("Mean", partial(figures.plot_states, table, mean, label="utility", cmap="viridis"))]
+    caption = f"The utility {where}: its posterior mean"
+    if "sd" in table:
+        spread = table["sd"].values + blank
+        panels.append(("Standard deviation", partial(figures.plot_states, table, spread, label="sd", cmap="magma")))
+        caption += ", and its standard deviation, bright where it does not know"
+    caption += ". The scale is free."
+    if np.isnan(blank).any():
+        caption += " Grey: too far from every centre of the features for the utility to be anything but zero."
+    blocks = [drawn("utility", panels, caption, f"Map of the utility {where}.")]
+    if "draws" in table:
+        draws = table["draws"].values
+        limits: dict[str, Any] = {"vmin": float(draws.min()), "vmax": float(draws.max()), "cmap": "viridis"}
+        panels = [
+            (f"Draw {i + 1}", partial(figures.plot_states, table, draw + blank, label="utility", **limits))
+            for i, draw in enumerate(draws)
+        ]
+        caption = "Three draws of the posterior on one scale: each explains the answers. What they share is known."
+        alt = f"Three posterior draws of the utility {where}."
+        blocks.append(drawn("draws", panels, caption, alt, columns=3, size=(3.5, 2.9)))
+    return blocks

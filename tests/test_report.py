@@ -1,0 +1,491 @@
+"""The report of a run: what it says, that it needs nothing else, and what it does with runs that are not whole."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import bayespbrl
+from bayespbrl import ReturnExpert
+from bayespbrl.cli import main
+from bayespbrl.diagnostics import report_figures, report_tables
+from bayespbrl.diagnostics.predictions import answer_probabilities
+from bayespbrl.diagnostics.report import assembled, write_report
+from bayespbrl.diagnostics.report_answers import surprise_order
+from bayespbrl.diagnostics.report_evidence import read_evidence
+from bayespbrl.diagnostics.report_findings import figure
+from bayespbrl.trajectories import trajectory_features
+
+QUICK = {"iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
+
+
+def start(directory, **changes):
+    return bayespbrl.start("gridworld", directory, **(QUICK | changes))
+
+
+class Reader(HTMLParser):
+    """The text of a page, its images, its headings, and every address that it would fetch."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.text, self.images, self.addresses, self.open, self.headings = "", [], [], [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        if tag not in ("meta", "img", "br", "link"):
+            self.open.append(tag)
+        if tag == "img":
+            self.images.append(named)
+        self.addresses += [named[name] for name in ("src", "href", "action") if name in named]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.text += data
+        if self.open and self.open[-1] == "h2":
+            self.headings.append(data)
+
+
+def read(path):
+    reader = Reader(path.read_text(encoding="utf-8"))
+    assert reader.open == []
+    return reader
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run with a posterior, its second answer wrong and its third a tie; only reports are to be written to it."""
+    directory = tmp_path_factory.mktemp("runs") / "finished"
+    answers = iter(["right", "wrong", "tie", "right"])
+
+    def expert(first, second):
+        right = ReturnExpert()(first, second)
+        return {"right": right, "wrong": "second" if right == "first" else "first", "tie": "tie"}[next(answers)]
+
+    start(directory).run(expert)
+    return directory
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    return Path(shutil.copytree(finished, tmp_path / "copy"))
+
+
+def contents(directory):
+    return {path: path.read_bytes() for path in directory.rglob("*") if path.is_file() and "report" not in path.name}
+
+
+def warned(evidence):
+    return [warning.what for warning in assembled(evidence)["warnings"]]
+
+
+# What the report says.
+
+
+def test_the_report_is_one_file_that_fetches_nothing_and_changes_nothing_else(finished):
+    before = contents(finished)
+    path = write_report(finished)
+    assert contents(finished) == before
+    assert path == finished / "report.html"
+    page = read(path)
+    assert page.images
+    assert all(address.startswith(("data:image/png;base64,", "#")) for address in page.addresses)
+    assert not re.search(r"https?:|@import|url\(|<script", path.read_text())
+    assert all(image["alt"] for image in page.images)
+
+
+def test_the_sections_come_in_the_order_of_the_questions_a_reader_asks(finished):
+    named = read(write_report(finished)).headings
+    order = ["What was learnt", "Warnings", "Learning curve", "converged", "thinks is good", "answers", "probabilities"]
+    order += ["policy updates", "σ and m", "All iterations"]
+    assert len(named) == len(order)
+    assert all(part in heading for part, heading in zip(order, named, strict=True))
+    assert "could not be made" not in read(write_report(finished)).text
+
+
+def test_the_head_says_the_value_and_how_far_the_posterior_can_be_trusted(finished):
+    run = bayespbrl.load(finished)
+    text = read(run.report()).text
+    last = run.iterations[-1]
+    assert "Finished: 3 iterations." in text
+    assert f"is {figure(last['value'])}" in text
+    assert f"largest R̂ {last['rhat_max']:.3f}" in text
+    assert f"agrees with {last['pairs_satisfied']} of {last['pairs']} preferences" in text
+
+
+def test_every_answer_is_drawn_with_both_trajectories_and_its_probability(finished):
+    page = read(write_report(finished))
+    evidence = read_evidence(finished)
+    assert len(evidence.answers) == 4
+    for record in evidence.answers:
+        assert f"Question {record.question}:" in page.text
+        for number in (record.first, record.second):
+            assert f"Drawing of trajectory {number}." in [image["alt"] for image in page.images]
+
+
+def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(finished):
+    evidence = read_evidence(finished)
+    table = report_tables.answers_table(evidence)
+    run = bayespbrl.load(finished)
+    likelihood = np.exp(run.posterior["log_likelihood"]["answers"].values).mean(axis=(0, 1))
+    np.testing.assert_allclose(table["before"][:2], 0.5)  # the prior knows nothing
+    np.testing.assert_array_equal(table["said"] == "tie", [False, False, True, False])
+    assert np.isnan(table["before"][2])
+    assert np.isnan(table["probability"][2])
+    np.testing.assert_allclose(table["probability"].values[[0, 1]], likelihood[:2])
+    # the third iteration's answer, by the estimate of the second
+    log = [json.loads(line) for line in (finished / "events.jsonl").read_text().splitlines()]
+    asked = [event for event in log if event["event"] == "asked"][-1]
+    said = [event for event in log if event["event"] == "answered"][-1]["answer"]
+    parts = bayespbrl.runs.read_iteration(finished / "iterations" / "0002.nc", "improved")
+    both = [run.trajectories[asked[name]] for name in ("first", "second")]
+    sums = trajectory_features(both, parts["estimate"].features, discount=run.settings.discount)
+    difference = (sums[[0]] - sums[[1]]) / parts["estimate"].scale
+    expected = answer_probabilities(parts["estimate"].posterior, difference)[0, 0 if said == "first" else 1]
+    assert float(table["before"][3]) == pytest.approx(expected)
+    assert float(table["probability"][3]) == pytest.approx(likelihood[-1])
+
+
+def test_the_most_surprising_answer_comes_first_and_ties_last():
+    columns = {"probability": [0.9, np.nan, 0.2, np.nan], "before": [0.5, np.nan, 0.6, 0.1], "margin": [1.0, 2, 3, 4]}
+    table = xr.Dataset({name: ("answer", values) for name, values in columns.items()})
+    np.testing.assert_array_equal(surprise_order(table), [3, 2, 0, 1])
+
+
+def test_the_utility_of_states_is_that_of_the_estimate_with_the_spread_of_its_draws(finished):
+    run = bayespbrl.load(finished)
+    table = report_tables.utility_table(read_evidence(finished))
+    assert (table.attrs["kind"], table.attrs["shape"]) == ("grid", (5, 5))
+    np.testing.assert_allclose(table["mean"], run.estimate.utilities(np.arange(25)))
+    draws = run.estimate.draws(np.eye(25))
+    np.testing.assert_allclose(table["sd"], draws.std(axis=(0, 1)), rtol=0.15)
+    np.testing.assert_allclose(table["prior_sd"], run.settings.prior_scale / run.estimate.scale)
+    assert int(table["visits"].sum()) == sum(len(trajectory.states) for trajectory in run.trajectories)
+    assert table.sizes["draw"] == 3
+
+
+@pytest.mark.parametrize(("observations", "kind", "size"), [(1, "line", 60), (2, "plane", 3600), (4, "cloud", 11 * 30)])
+def test_states_of_any_dimension_are_shown(tmp_path, observations, kind, size):
+    env = Drift(observations)
+    learner = bayespbrl.start(env, tmp_path / "run", **(QUICK | {"iterations": 1, "trajectories_per_iteration": 30}))
+    learner.run(ReturnExpert())
+    content = assembled(read_evidence(tmp_path / "run", env=env))
+    assert not any("could not be made" in paragraph for section in content["sections"] for paragraph in section.text)
+    table = report_tables.utility_table(read_evidence(tmp_path / "run", env=env))
+    assert table.attrs["kind"] == kind
+    assert table.sizes["state"] == size
+    if kind == "cloud":
+        assert table.attrs["dimensions"] == (1, 3)  # the others hardly leave their place
+
+
+class Drift(gymnasium.Env):
+    """Ten steps; the odd dimensions (or the only one) go where the action says, the others stay but for one jump."""
+
+    def __init__(self, observations):
+        self.observation_space = gymnasium.spaces.Box(-100, 100, (observations,))
+        self.action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.time = self.np_random.normal(size=self.observation_space.shape), 0
+        self.state[0::2] *= 1.0 if self.state.size < 3 else 1e-3
+        return self.state.astype(np.float32), {}
+
+    def step(self, action):
+        self.time += 1
+        moving = slice(1, None, 2) if self.state.size > 1 else slice(None)
+        self.state[moving] += 2 * int(action) - 1
+        if self.state.size > 2 and self.time == 10 and self.np_random.random() < 0.1:
+            self.state[0::2] += 50.0
+        return self.state.astype(np.float32), float(self.state[-1]), False, self.time == 10, {}
+
+
+def test_every_figure_takes_axes_and_returns_them_and_every_table_is_a_data_set(finished):
+    evidence = read_evidence(finished)
+    iterations = report_tables.iterations_table(evidence.iterations)
+    states, answers = report_tables.utility_table(evidence), report_tables.answers_table(evidence)
+    scores, compared = report_tables.prequential_table(evidence), report_tables.trajectories_table(evidence)
+    assert all(isinstance(table, xr.Dataset) for table in (iterations, states, answers, scores, compared))
+    line = states.assign_attrs(kind="line")
+    calls = [(report_figures.plot_column, iterations, "kl"), (report_figures.plot_answers, answers)]
+    calls += [(report_figures.plot_states, states, states["mean"].values), (report_figures.plot_state_bands, line)]
+    calls += [(report_figures.plot_trajectories, compared)]
+    names = ("plot_value", "plot_rhat", "plot_effective_sample_size", "plot_bound", "plot_temperature", "plot_entropy")
+    calls += [(getattr(report_figures, name), iterations) for name in names]
+    drawers = {name for name in vars(report_figures) if name.startswith("plot_")}
+    assert {call[0].__name__ for call in calls} == drawers
+    for draw, *arguments in calls:
+        axes = Figure().subplots()
+        options = {"label": "utility"} if draw is report_figures.plot_states else {}
+        assert draw(*arguments, axes, **options) is axes
+        assert isinstance(axes, Axes)
+        assert axes.has_data()
+
+
+# Warnings.
+
+
+def test_a_run_in_order_has_no_warning_and_one_that_is_not_says_what_to_do(finished, copy):
+    content = assembled(read_evidence(finished))
+    assert all(warning.do for warning in content["warnings"])
+    summary = json.loads((copy / "summary.json").read_text())
+    assert [s["iteration"] for s in summary["iterations"]] == [1, 2, 3]
+    changed = [{"utility_converged": False, "rhat_max": 1.5}, {"reps_converged": False}, {"bound_active": False}]
+    changed[2] |= {"entropy": 0.01, "value": -1000.0}
+    rewrite(copy, changed)
+    found = " ".join(warned(read_evidence(copy)))
+    assert "did not converge in iteration 1." in found
+    assert "REPS did not converge in iteration 2:" in found
+    assert "bound was inactive in iteration" in found
+    assert "entropy collapsed" in found
+    assert "value has fallen" in found
+
+
+def rewrite(directory, changes, **more):
+    """Put other numbers into the summaries of a run."""
+    lines = [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]
+    improved = [event for event in lines if event["event"] == "improved"]
+    for event, change in zip(improved, changes, strict=True):
+        event["summary"].update(change)
+    (directory / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in lines))
+
+
+def test_an_answer_that_the_estimate_contradicts_is_named(tmp_path):
+    trick = iter(["first", "first", "second", "first"])
+    directory = tmp_path / "run"
+    learner = start(directory, utility="linear-program", iterations=1)
+    learner.run(lambda first, second: next(trick))
+    evidence = read_evidence(directory)
+    table = report_tables.answers_table(evidence)
+    assert (table["margin"].values > 0).all()
+    swapped = [record.__class__(**{**vars(record), "answer": "second"}) for record in evidence.answers]
+    turned = evidence.__class__(**{**vars(evidence), "answers": tuple(swapped)})
+    assert any("contradicts 2 answers: 1–2" in text for text in warned(turned))
+
+
+def test_what_a_schedule_and_the_choice_of_hyperparameters_said_is_shown(copy):
+    rows = [
+        {
+            "schedule": {"statistic": 0.5 + i / 10, "reason": "<b>sure</b> enough", "diagnostics": {"rhat_max": 1.0}},
+            "hyperparameters": {"bandwidth_factor": 2.0**i, "weights": [0.25, 0.75]},
+            "action_standard_deviation": [0.3, 0.1],
+        }
+        for i in range(3)
+    ]
+    rewrite(copy, rows)
+    table = report_tables.iterations_table(read_evidence(copy).iterations)
+    np.testing.assert_allclose(table["schedule statistic"], [0.5, 0.6, 0.7])
+    np.testing.assert_allclose(table["hyperparameters bandwidth_factor"], [1, 2, 4])
+    np.testing.assert_allclose(table["action_standard_deviation"], 0.2)
+    path = write_report(copy)
+    assert "<b>sure</b> enough" in read(path).text  # as text,
+    assert "<b>sure" not in path.read_text()  # not as markup
+    assert "diagnostics rhat_max" in read(path).text
+
+
+# Runs that are not whole.
+
+
+def test_a_run_in_progress_has_a_report_at_every_stage(tmp_path):
+    directory = tmp_path / "run"
+    learner = start(directory, iterations=2)
+    stages = ["no iteration is completed, 0 answers", "no iteration is completed, 0 answers have been given"]
+    for stage in range(4):
+        text = read(write_report(directory)).text
+        assert "could not be made" not in text
+        if stage < 2:
+            assert stages[stage] in text
+        if stage:
+            assert f"Question {stage} waits for an answer." in text
+        questions = learner.ask()
+        if stage:
+            learner.tell([ReturnExpert()(*query.trajectories) for query in questions])
+    assert "Finished" in read(write_report(directory)).text
+
+
+@pytest.mark.parametrize("utility", ["linear-program", "known-reward"])
+def test_a_utility_without_a_posterior_is_said_to_have_none(tmp_path, utility):
+    start(tmp_path / "run", utility=utility).run(ReturnExpert())
+    text = read(write_report(tmp_path / "run")).text
+    assert f"utility is {utility}, which has no posterior" in text
+    assert "could not be made" not in text
+
+
+def test_a_run_whose_answers_were_all_ties_has_a_report(tmp_path):
+    start(tmp_path / "run", iterations=1).run(lambda first, second: "tie")
+    text = read(write_report(tmp_path / "run")).text
+    assert "could not be made" not in text
+    assert "2 of 2 answers were ties" in text
+
+
+def test_features_of_ones_own_are_asked_for_and_used_when_passed(tmp_path):
+    def own(states):
+        return np.stack([states % 5, states // 5], axis=1).astype(float)
+
+    directory = tmp_path / "run"
+    bayespbrl.start("gridworld", directory, features=own, **QUICK).run(ReturnExpert())
+    without = read(write_report(directory)).text
+    assert "features of your own" in without
+    assert "could not be made" not in without
+    assert "largest R̂" in without  # what needs no features is there
+    passed = read(bayespbrl.load(directory, features=own).report()).text
+    assert "features of your own" not in passed
+    assert "The utility over the cells of the grid" in passed
+
+
+def test_an_environment_that_cannot_be_opened_costs_only_what_needs_it(copy):
+    settings = json.loads((copy / "settings.json").read_text())
+    (copy / "settings.json").write_text(json.dumps(settings | {"env": "Mine-v0"}))
+    text = read(write_report(copy)).text
+    assert "environment cannot be opened" in text
+    assert "could not be made" not in text
+    assert "largest R̂" in text
+
+
+def test_a_feature_function_that_fails_costs_only_its_sections(tmp_path):
+    calls = []
+
+    def own(states):
+        if calls:
+            raise RuntimeError("no more of this")
+        return np.stack([states % 5, states // 5], axis=1).astype(float)
+
+    directory = tmp_path / "run"
+    start(directory, features=own, iterations=1).run(ReturnExpert())
+    calls.append(1)
+    text = read(write_report(directory, features=own)).text
+    assert "RuntimeError: no more of this" in text
+    assert "largest R̂" in text
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_a_truncated_iteration_file_is_named_and_the_rest_is_reported(copy, number):
+    file = copy / "iterations" / f"000{number}.nc"
+    file.write_bytes(file.read_bytes()[:3000])
+    before = contents(copy)
+    text = read(write_report(copy)).text
+    assert contents(copy) == before
+    assert f"Broken: iterations/000{number}.nc" in text
+    assert "could not be made" not in text
+    assert "policy's value" in text
+    assert ("utility estimate that can be read is that of iteration 2" in text) == (number == 3)
+
+
+def test_a_log_that_is_cut_off_or_damaged_is_read_up_to_there(copy):
+    file = copy / "events.jsonl"
+    lines = file.read_bytes().splitlines(keepends=True)
+    file.write_bytes(b"".join(lines) + lines[-1][:20])
+    assert any("last line is cut off" in text for text in warned(read_evidence(copy)))
+    (copy / "summary.json").unlink()
+    file.write_bytes(b"".join(lines[:8]) + b"\xff\x00garbage\n" + b"".join(lines[8:]))
+    evidence = read_evidence(copy)
+    assert len(evidence.iterations) == 1
+    assert any("line 9" in text for text in warned(evidence))
+    assert "could not be made" not in read(write_report(copy)).text
+
+
+@pytest.mark.parametrize("damage", ["missing log", "foreign log", "missing iterations", "broken summary"])
+def test_whatever_is_missing_there_is_a_report(copy, damage):
+    if damage == "missing log":
+        (copy / "events.jsonl").unlink()
+    elif damage == "foreign log":
+        (copy / "events.jsonl").write_text('{"event": "answered"}\n[]\n')
+    elif damage == "missing iterations":
+        shutil.rmtree(copy / "iterations")
+    else:
+        (copy / "summary.json").write_text("{")
+    text = read(write_report(copy)).text
+    assert "Broken" in text
+    assert "could not be made" not in text
+    assert "policy's value" in text
+
+
+def test_a_wholly_gutted_run_has_a_report(copy):
+    for name in ("events.jsonl", "summary.json"):
+        (copy / name).write_text("nothing\n")
+    shutil.rmtree(copy / "iterations")
+    text = read(write_report(copy)).text
+    assert "Nothing has been learnt yet" in text
+    assert "could not be made" not in text
+
+
+@pytest.mark.parametrize("kind", ["nowhere", "empty", "foreign", "newer", "file"])
+def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, copy, tmp_path, kind):
+    path = tmp_path / kind
+    if kind in ("empty", "foreign"):
+        path.mkdir()
+    if kind == "foreign":
+        (path / "settings.json").write_text("[1, 2]")
+    if kind == "file":
+        path.write_text("a file")
+    if kind == "newer":
+        path = copy
+        settings = json.loads((copy / "settings.json").read_text())
+        (copy / "settings.json").write_text(json.dumps(settings | {"format": 99}))
+    monkeypatch.setattr(sys, "argv", ["bayespbrl", "report", str(path)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert error.count("\n") == 1
+    assert "settings" in error
+    assert str(path) in error
+    assert not list(tmp_path.rglob("report*"))
+
+
+# The command line, and Markdown.
+
+
+def test_the_command_line_writes_the_report_and_says_where(monkeypatch, capsys, copy):
+    monkeypatch.setattr(sys, "argv", ["bayespbrl", "report", str(copy), "--format", "md"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    assert "report.md" in re.sub(r"\s", "", capsys.readouterr().out)
+    text = (copy / "report.md").read_text()
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)
+    assert pictures
+    assert all((copy / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
+    assert not (copy / "report.html").exists()
+    for block in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE):  # every table is whole
+        assert len({line.count("|") for line in block.splitlines()}) == 1
+
+
+def test_a_format_that_there_is_not_is_refused(finished):
+    with pytest.raises(ValueError, match="format: expected html or md, got 'pdf'"):
+        bayespbrl.load(finished).report("pdf")
+
+
+def test_a_report_takes_the_place_of_the_one_before(copy):
+    (copy / "report.html").write_text("old")
+    assert write_report(copy).read_text() != "old"
+    assert [path.name for path in copy.glob("report*")] == ["report.html"]
+
+
+def test_importing_the_package_does_not_import_the_report():
+    code = "import sys, bayespbrl; assert not any('report' in n or n == 'jinja2' for n in sys.modules if 'bayes' in n)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.slow
+def test_a_report_of_a_swing_up_run_draws_the_utility_over_the_plane(tmp_path):
+    directory = tmp_path / "run"
+    bayespbrl.start("swing-up", directory, iterations=3, centres=100, evaluation_episodes=5).run(ReturnExpert())
+    path = write_report(directory)
+    text = read(path).text
+    assert "over the range of what was observed" in text
+    assert "could not be made" not in text
+    assert path.stat().st_size < 2e6
