@@ -1,0 +1,185 @@
+"""Where the time of a trial goes: seconds by step of the cycle, and the peak of memory.
+
+    python benchmarks/cycle.py [gridworld|bicycle|swing-up|acrobot|<gymnasium id>]
+        [--iterations N] [--seed S] [--utility NAME] [--policy KIND]
+
+runs one trial with the simulated expert and the domain's preset, and prints a table and one JSON line. The library is
+timed from outside: its functions are replaced by timed ones wherever they are bound. Each second counts once, for the
+innermost step, and a second in which JAX traces or compiles for `compilation` instead of the step that needed it.
+"""
+
+import argparse
+import functools
+import itertools
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from bayespbrl import Learner, ReturnExpert, features, lstd, models, policies, reps, rollouts, trajectories
+from bayespbrl.policies import batch, hyperparameter_search
+
+FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
+    "features": (
+        features.draw_state_features,
+        features.draw_state_action_features,
+        trajectories.trajectory_features,
+    ),
+    "sampler": (models.sample_posterior,),
+    "evidence": (models.select_hyperparameters,),
+    "linear program": (models.linear_program,),
+    "LSTD": (lstd.lstd_q,),
+    "dual": (reps.reps_weights,),
+    "CMA-ES": (hyperparameter_search.search,),
+    "actions": (batch.sample_actions, batch.entropies),
+    "rollouts": (rollouts.rollout,),
+    "evaluation": (rollouts.returns,),
+}
+METHODS: dict[str, tuple[tuple[type, str], ...]] = {
+    "features": (
+        (features.RadialBasis, "__call__"),
+        (features.JointRadialBasis, "__call__"),
+        (features.StateActionProduct, "__call__"),
+        (features.OneHot, "__call__"),
+    ),
+    "policy fit": tuple(
+        (kind, "fit")
+        for kind in (
+            policies.GaussianProcessPolicy,
+            policies.LinearGaussianPolicy,
+            policies.SoftmaxPolicy,
+            policies.TabularPolicy,
+        )
+    ),
+}
+REST = "rest"
+
+
+class Stopwatch:
+    """Seconds by step, each counted once: for the step that was entered last.
+
+    Attributes:
+      seconds: by step.
+      programs: compiled so far.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {REST: 0.0, "compilation": 0.0}
+        self.programs = 0
+        self._inside = [REST]
+        self._since = time.perf_counter()
+        self._compiled: list[tuple[float, float]] = []  # intervals, disjoint and in order
+
+    def switch(self) -> None:
+        """Book the time since the last switch on the innermost step."""
+        now = time.perf_counter()
+        step = self._inside[-1]
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._since
+        self._since = now
+
+    def timed(self, step: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """`function`, whose time counts for `step`."""
+
+        @functools.wraps(function)
+        def wrapper(*arguments: Any, **options: Any) -> Any:
+            self.switch()
+            self._inside.append(step)
+            try:
+                return function(*arguments, **options)
+            finally:
+                self.switch()
+                self._inside.pop()
+
+        return wrapper
+
+    def compiled(self, event: str, duration_secs: float, **details: Any) -> None:
+        """Listen to JAX: what has just been traced or compiled, moved from the step it happened in."""
+        if not event.startswith("/jax/core/compile/"):
+            return
+        self.programs += event.endswith("backend_compile_duration")
+        end = time.perf_counter()
+        begin, counted = end - duration_secs, 0.0
+        while self._compiled and self._compiled[-1][0] >= begin:  # a function traced within this one
+            inner = self._compiled.pop()
+            counted += inner[1] - inner[0]
+        self._compiled.append((begin, end))
+        self.seconds["compilation"] += duration_secs - counted
+        step = self._inside[-1]
+        self.seconds[step] = self.seconds.get(step, 0.0) - (duration_secs - counted)
+
+
+def install(stopwatch: Stopwatch) -> None:
+    """Replace the functions of the steps by timed ones, in every module that has bound them."""
+    for step, functions in FUNCTIONS.items():
+        for function in functions:
+            timed = stopwatch.timed(step, function)
+            for name, module in list(sys.modules.items()):
+                if name.startswith("bayespbrl"):
+                    for attribute, value in list(vars(module).items()):
+                        if value is function:
+                            setattr(module, attribute, timed)
+    for step, methods in METHODS.items():
+        for kind, name in methods:
+            setattr(kind, name, stopwatch.timed(step, getattr(kind, name)))
+    jax.monitoring.register_event_duration_secs_listener(stopwatch.compiled)
+
+
+def measure(environment: str, **settings: Any) -> dict[str, Any]:
+    """One trial, measured; as the JSON line has it."""
+    stopwatch = Stopwatch()
+    install(stopwatch)
+    began = [time.perf_counter()]
+
+    def finished_iteration(learner: Learner) -> None:
+        while len(began) <= learner.state.iteration:
+            began.append(time.perf_counter())
+
+    learner = Learner(environment, **settings)
+    learner.run(ReturnExpert(), progress=finished_iteration)
+    finished_iteration(learner)
+    stopwatch.switch()
+    steps = {step: round(seconds, 3) for step, seconds in stopwatch.seconds.items() if abs(seconds) >= 5e-4}
+    return {
+        "benchmark": "cycle",
+        "environment": environment,
+        "utility": learner.settings.utility,
+        "seed": learner.settings.seed,
+        "iterations": learner.settings.iterations,
+        "answers": learner.preferences.answers,
+        "transitions": sum(len(trajectory) for trajectory in learner.trajectories),
+        "value": learner.iterations[-1]["value"],
+        "seconds": round(began[-1] - began[0], 3),
+        "seconds_by_step": dict(sorted(steps.items(), key=lambda item: -item[1])),
+        "seconds_by_iteration": [round(after - before, 3) for before, after in itertools.pairwise(began)],
+        "programs_compiled": stopwatch.programs,
+        "peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "cores": os.cpu_count(),
+        "device": jax.devices()[0].platform,
+    }
+
+
+def main() -> None:
+    """Measure, and print a table and one JSON line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("environment", nargs="?", default="swing-up")
+    parser.add_argument("--iterations", type=int)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--utility")
+    parser.add_argument("--policy")
+    parser.add_argument("--centres", type=int)
+    arguments = vars(parser.parse_args())
+    result = measure(arguments.pop("environment"), **arguments)
+    print(f"{result['environment']}, {result['utility']}, {result['iterations']} iterations: {result['seconds']:.1f} s")
+    for step, seconds in result["seconds_by_step"].items():
+        print(f"  {step:<16}{seconds:9.2f} s {seconds / result['seconds']:7.1%}")
+    print(f"  peak memory {result['peak_memory_mib']} MiB, {result['programs_compiled']} programs compiled")
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
