@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 LINKS = ("models", "diagnostics", "envs")
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "bayespbrl").rglob("*.py")}
+TEMPLATES = {f"bayespbrl/diagnostics/report.{form}.jinja" for form in ("html", "md")}
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
     tops = {name.split("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"bayespbrl"}
     assert {name for name in names if name.endswith(".py")} == MODULES
-    assert "bayespbrl/py.typed" in names
+    assert {"bayespbrl/py.typed", *TEMPLATES} <= set(names)
     assert any(name.endswith("LICENSE") for name in names)
 
 
@@ -49,7 +50,7 @@ def test_the_sdist_holds_no_link_and_no_second_copy(built):
     assert not any(member.issym() or member.islnk() for member in members)
     assert not any(name.split("/")[0] in LINKS for name in inner)
     assert {name for name in inner if name.startswith("bayespbrl/") and name.endswith(".py")} == MODULES
-    assert {"pyproject.toml", "README.md", "LICENSE", "bayespbrl/py.typed"} <= inner
+    assert {"pyproject.toml", "README.md", "LICENSE", "bayespbrl/py.typed", *TEMPLATES} <= inner
 
 
 def test_an_installed_package_puts_no_models_diagnostics_or_envs_on_the_path(tmp_path):

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import bayespbrl
 from bayespbrl import ReturnExpert
 from bayespbrl.cli import main
-from bayespbrl.diagnostics import report_figures, report_tables
+from bayespbrl.diagnostics import report_document, report_figures, report_tables
 from bayespbrl.diagnostics.predictions import answer_probabilities
 from bayespbrl.diagnostics.report import assembled, write_report
 from bayespbrl.diagnostics.report_answers import surprise_order
@@ -31,6 +31,18 @@ QUICK = {"iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
 
 def start(directory, **changes):
     return bayespbrl.start("gridworld", directory, **(QUICK | changes))
+
+
+@pytest.fixture
+def drawn():
+    """Asked for by tests that need real pictures."""
+
+
+@pytest.fixture(autouse=True)
+def quick_pictures(request, monkeypatch):
+    """Drawing takes most of a report's time; most tests read its text."""
+    if "drawn" not in request.fixturenames:
+        monkeypatch.setattr(report_document, "_png", lambda *arguments, **options: b"\x89PNG")
 
 
 class Reader(HTMLParser):
@@ -81,7 +93,8 @@ def finished(tmp_path_factory):
 
 @pytest.fixture
 def copy(finished, tmp_path):
-    return Path(shutil.copytree(finished, tmp_path / "copy"))
+    without = shutil.ignore_patterns("report*")
+    return Path(shutil.copytree(finished, tmp_path / "copy", ignore=without))
 
 
 def contents(directory):
@@ -95,7 +108,7 @@ def warned(evidence):
 # What the report says.
 
 
-def test_the_report_is_one_file_that_fetches_nothing_and_changes_nothing_else(finished):
+def test_the_report_is_one_file_that_fetches_nothing_and_changes_nothing_else(finished, drawn):
     before = contents(finished)
     path = write_report(finished)
     assert contents(finished) == before
@@ -108,12 +121,12 @@ def test_the_report_is_one_file_that_fetches_nothing_and_changes_nothing_else(fi
 
 
 def test_the_sections_come_in_the_order_of_the_questions_a_reader_asks(finished):
-    named = read(write_report(finished)).headings
+    page = read(write_report(finished))
     order = ["What was learnt", "Warnings", "Learning curve", "converged", "thinks is good", "answers", "probabilities"]
     order += ["policy updates", "σ and m", "All iterations"]
-    assert len(named) == len(order)
-    assert all(part in heading for part, heading in zip(order, named, strict=True))
-    assert "could not be made" not in read(write_report(finished)).text
+    assert len(page.headings) == len(order)
+    assert all(part in heading for part, heading in zip(order, page.headings, strict=True))
+    assert "could not be made" not in page.text
 
 
 def test_the_head_says_the_value_and_how_far_the_posterior_can_be_trusted(finished):
@@ -338,11 +351,11 @@ def test_features_of_ones_own_are_asked_for_and_used_when_passed(tmp_path):
     directory = tmp_path / "run"
     bayespbrl.start("gridworld", directory, features=own, **QUICK).run(ReturnExpert())
     without = read(write_report(directory)).text
-    assert "features of your own" in without
+    assert "features are a function of your own, and it was not passed again" in without
     assert "could not be made" not in without
     assert "largest R̂" in without  # what needs no features is there
     passed = read(bayespbrl.load(directory, features=own).report()).text
-    assert "features of your own" not in passed
+    assert "function of your own" not in passed
     assert "The utility over the cells of the grid" in passed
 
 
@@ -367,8 +380,11 @@ def test_a_feature_function_that_fails_costs_only_its_sections(tmp_path):
     start(directory, features=own, iterations=1).run(ReturnExpert())
     calls.append(1)
     text = read(write_report(directory, features=own)).text
-    assert "RuntimeError: no more of this" in text
+    assert "the one that was passed fails (RuntimeError: no more of this)" in text
+    assert "could not be made" not in text
     assert "largest R̂" in text
+    other = read(write_report(directory, features=lambda states: np.ones((len(states), 3)))).text
+    assert "has 3 features, the run's 2" in other
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
@@ -449,7 +465,7 @@ def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, copy, tmp_pa
 # The command line, and Markdown.
 
 
-def test_the_command_line_writes_the_report_and_says_where(monkeypatch, capsys, copy):
+def test_the_command_line_writes_the_report_and_says_where(monkeypatch, capsys, copy, drawn):
     monkeypatch.setattr(sys, "argv", ["bayespbrl", "report", str(copy), "--format", "md"])
     with pytest.raises(SystemExit) as stop:
         main()
@@ -481,7 +497,7 @@ def test_importing_the_package_does_not_import_the_report():
 
 
 @pytest.mark.slow
-def test_a_report_of_a_swing_up_run_draws_the_utility_over_the_plane(tmp_path):
+def test_a_report_of_a_swing_up_run_draws_the_utility_over_the_plane(tmp_path, drawn):
     directory = tmp_path / "run"
     bayespbrl.start("swing-up", directory, iterations=3, centres=100, evaluation_episodes=5).run(ReturnExpert())
     path = write_report(directory)

@@ -68,7 +68,7 @@ def assembled(evidence: Evidence) -> dict[str, Any]:
     iterations = report_tables.iterations_table(evidence.iterations)
     answers = report_tables.answers_table(evidence)
     scores = report_tables.prequential_table(evidence)
-    failures: list[report_warnings.Warning] = []
+    failures: list[report_warnings.Caution] = []
     parts: list[tuple[str, Callable[[], Section]]] = [
         ("Learning curve", lambda: report_sections.learning(evidence, iterations)),
         ("Have the fits converged?", lambda: report_sections.fits(evidence, iterations)),
@@ -91,14 +91,14 @@ def assembled(evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def _built(title: str, build: Callable[[], Section], failures: list[report_warnings.Warning]) -> Section:
+def _built(title: str, build: Callable[[], Section], failures: list[report_warnings.Caution]) -> Section:
     """A section, or one that says why it could not be made: whatever an environment or features of the user's raise."""
     try:
         return build()
     except Exception as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         failures.append(
-            report_warnings.Warning(
+            report_warnings.Caution(
                 f"The section “{title}” could not be made ({reason}).", "The others are unaffected."
             )
         )

@@ -17,6 +17,7 @@ from bayespbrl import events
 from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.events import Entry, LearnerState
+from bayespbrl.features import checked_features
 from bayespbrl.preferences import Answer, Preferences
 from bayespbrl.runs import RunDirectory, read_parts, read_summary
 from bayespbrl.settings import Settings
@@ -58,7 +59,7 @@ class Evidence:
       trajectories: by number, those that can be read.
       estimate: the newest utility estimate that can be read, which is that after iteration `estimate_iteration`; None
         and 0 without any.
-      features_missing: the estimate's φ is a function of the user's that was not passed again.
+      features_missing: why the estimate's φ, a function of the user's, cannot be used; empty where it can.
       environment: opened; None where it cannot be.
       waiting: the number of the question that waits for an answer.
       broken: what could not be read, a sentence each.
@@ -72,7 +73,7 @@ class Evidence:
     trajectories: Mapping[int, Trajectory] = field(default_factory=dict)
     estimate: Any = None
     estimate_iteration: int = 0
-    features_missing: bool = False
+    features_missing: str = ""
     environment: Any = None
     waiting: int | None = None
     broken: tuple[str, ...] = ()
@@ -128,7 +129,6 @@ def read_evidence(directory: Path | str, *, env: Any = None, features: Any = Non
 
 
 def _not_passed(states: np.ndarray) -> np.ndarray:
-    """Stands for features of the user's own that were not passed again."""
     raise ValueError("features: expected those that the run was started with, got none")
 
 
@@ -136,15 +136,12 @@ class _Reader:
     """Reads one iteration's file after the other, and predicts its answers by the estimate from before them."""
 
     def __init__(self, log: RunDirectory, features: Callable[[np.ndarray], np.ndarray] | None, broken: list[str]):
-        self.log, self.broken = log, broken
-        self.features = _not_passed if features is None else features
+        self.log, self.broken, self.features, self.features_missing = log, broken, features, ""
+        if features is None and log.settings.features == "other":
+            self.features, self.features_missing = _not_passed, "it was not passed again"
         self.trajectories: dict[int, Trajectory] = {}
         self.estimate: Any = None
         self.estimate_iteration = 0
-
-    @property
-    def features_missing(self) -> bool:
-        return getattr(self.estimate, "features", None) is _not_passed
 
     def read(self, number: int, records: list[AnswerRecord], *, improved: bool) -> list[AnswerRecord]:
         """`records` with the predictions of the answers of iteration `number`."""
@@ -166,7 +163,19 @@ class _Reader:
             records = [self._predicted(record) if record.iteration == number else record for record in records]
         if "estimate" in parts:
             self.estimate, self.estimate_iteration = parts["estimate"], number
+            self.features_missing = self.features_missing or self._failure(parts["trajectories"][0])
         return records
+
+    def _failure(self, trajectory: Trajectory) -> str:
+        """What is wrong with features that were passed."""
+        if self.features is None or not hasattr(self.estimate, "weights"):
+            return ""
+        try:
+            number = checked_features(self.features, trajectory.states).shape[1]
+        except Exception as error:  # a function of the user's may raise anything
+            return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
+        expected = len(self.estimate.weights)
+        return "" if number == expected else f"the one that was passed has {number} features, the run's {expected}"
 
     def _predicted(self, record: AnswerRecord) -> AnswerRecord:
         numbers = (record.first, record.second)

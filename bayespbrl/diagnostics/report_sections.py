@@ -144,7 +144,11 @@ def leaning(evidence: Evidence) -> Section:
     title = "How much leans on σ and m"
     if evidence.posterior is None:
         return Section("sensitivity", title, [no_posterior(evidence)])
-    result = sensitivity(thinned(evidence.posterior, 4000))
+    try:
+        result = sensitivity(thinned(evidence.posterior, 4000))
+    except ValueError as error:  # ArviZ cannot smooth a tail of equal weights
+        few = "That happens while the answers are few and most draws explain them equally well."
+        return Section("sensitivity", title, [f"It cannot be estimated ({error}) {few}"])
     number = result.sizes["quantity"]
     if not number:
         return Section("sensitivity", title, ["There is no preference yet that could lean on anything."])

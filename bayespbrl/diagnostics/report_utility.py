@@ -19,7 +19,7 @@ def utility(evidence: Evidence) -> Section:
     if evidence.estimate is None:
         return Section("utility", title, ["No utility estimate yet."])
     if evidence.features_missing:
-        return Section("utility", title, ["The features φ are a function of your own that was not passed again."])
+        return Section("utility", title, [f"The features φ are a function of your own: {evidence.features_missing}."])
     blocks: list[Any] = []
     text = [] if evidence.posterior is not None else [no_posterior(evidence)]
     if hasattr(evidence.estimate, "utilities"):

@@ -18,8 +18,8 @@ SURPRISING = 0.1
 
 
 @dataclass(frozen=True)
-class Warning:
-    """Something that is not in order.
+class Caution:
+    """Something that is not in order, and the way out.
 
     Attributes:
       what: one sentence or two.
@@ -30,14 +30,14 @@ class Warning:
     do: str
 
 
-def warnings(evidence: Evidence, iterations: xr.Dataset, answers: xr.Dataset, scores: xr.Dataset) -> list[Warning]:
+def warnings(evidence: Evidence, iterations: xr.Dataset, answers: xr.Dataset, scores: xr.Dataset) -> list[Caution]:
     """What is not in order, most serious first."""
-    found = [Warning(f"Broken: {text}", _mending(text)) for text in evidence.broken]
+    found = [Caution(f"Broken: {text}", _mending(text)) for text in evidence.broken]
     if evidence.features_missing:
         found.append(
-            Warning(
-                "The run used state features of your own, which no file holds: the utility of states, and what was "
-                "expected of each answer beforehand, are missing here.",
+            Caution(
+                f"The run's state features are a function of your own, and {evidence.features_missing}: the utility of "
+                "states, and what was expected of each answer beforehand, are missing here.",
                 "Call bayespbrl.load(directory, features=...).report() with the function you started the run with.",
             )
         )
@@ -46,15 +46,15 @@ def warnings(evidence: Evidence, iterations: xr.Dataset, answers: xr.Dataset, sc
     return found + _of_answers(evidence, answers, scores)
 
 
-def _of_fits(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
+def _of_fits(evidence: Evidence, table: xr.Dataset) -> list[Caution]:
     failed = table["iteration"].values[table["utility_converged"].values == 0]
     if not failed.size:
         return []
     last = "The last fit is among them. " if failed[-1] == table.sizes["iteration"] else ""
     if evidence.settings.utility == "linear-program":
-        return [Warning(f"The linear program failed in {_which(failed)}.", "Its status is in summary.json.")]
+        return [Caution(f"The linear program failed in {_which(failed)}.", "Its status is in summary.json.")]
     return [
-        Warning(
+        Caution(
             f"The posterior did not converge in {_which(failed)}. {last}What is said of uncertainty there is not to be "
             "relied on, nor is the policy update that followed.",
             "Look at the rank plots. A lapse rate above zero (--lapse-rate 0.1) softens answers that contradict each "
@@ -63,11 +63,11 @@ def _of_fits(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
     ]
 
 
-def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
+def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Caution]:
     found, iteration = [], table["iteration"].values
     if (failed := iteration[table["reps_converged"].values == 0]).size:
         found.append(
-            Warning(
+            Caution(
                 f"REPS did not converge in {_which(failed)}: the policy stayed where it was.",
                 "Fewer centres (--centres) or a smaller --kl-bound make the dual easier.",
             )
@@ -75,7 +75,7 @@ def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
     solved = table["reps_converged"].values != 0
     if (idle := iteration[(table["bound_active"].values == 0) & solved]).size:
         found.append(
-            Warning(
+            Caution(
                 f"The KL bound was inactive in {_which(idle)}: no admissible policy was as far away as allowed.",
                 "Harmless once the policy is good: there is no more to gain. If the value is poor, the utility no "
                 "longer tells actions apart: ask more questions, or a policy with more entropy.",
@@ -84,14 +84,14 @@ def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
     fitted, reached = table["kl_fitted_policy"].values, table["kl"].values
     if (bold := iteration[fitted > 3 * np.maximum(reached, 0.01)]).size:
         found.append(
-            Warning(
+            Caution(
                 f"The fitted policy went more than three times as far as REPS asked for in {_which(bold)}.",
                 "The bound does not hold there. Another kind of policy (--policy), or a smaller --kl-bound.",
             )
         )
     if (tame := iteration[(fitted < reached / 3) & (reached > 0.02)]).size > 0.2 * len(iteration):
         found.append(
-            Warning(
+            Caution(
                 f"The fitted policy went less than a third as far as REPS asked for in {_which(tame)}.",
                 "The policy smooths the update. Harmless while the value rises; a larger --kl-bound takes it further.",
             )
@@ -99,7 +99,7 @@ def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
     return found + _of_entropy(evidence, table)
 
 
-def _of_entropy(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
+def _of_entropy(evidence: Evidence, table: xr.Dataset) -> list[Caution]:
     first, last = float(table["entropy"][0]), float(table["entropy"][-1])
     space = getattr(evidence.environment, "action_space", None)
     if isinstance(space, Discrete):
@@ -110,7 +110,7 @@ def _of_entropy(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
     if not collapsed:
         return []
     return [
-        Warning(
+        Caution(
             f"The policy's entropy collapsed, from {first:.2f} to {last:.2f} nats: it hardly explores any more.",
             "Right if the value is good. If not, it settled too early: a smaller --kl-bound narrows it more slowly; "
             "start again with another --seed to see whether it was chance.",
@@ -118,25 +118,25 @@ def _of_entropy(evidence: Evidence, table: xr.Dataset) -> list[Warning]:
     ]
 
 
-def _of_value(table: xr.Dataset) -> list[Warning]:
+def _of_value(table: xr.Dataset) -> list[Caution]:
     value = table["value"].values
     if len(value) < 3 or np.isnan(value).any() or np.max(value) - value[-1] <= 0.15 * (np.max(value) - np.min(value)):
         return []
     best = int(np.argmax(value))
     return [
-        Warning(
+        Caution(
             f"The value has fallen from {figure(value[best])} (iteration {best + 1}) to {figure(value[-1])}.",
             "A noisy evaluation, or an update that was too bold: look at the KL, and try a smaller --kl-bound.",
         )
     ]
 
 
-def _of_answers(evidence: Evidence, answers: xr.Dataset, scores: xr.Dataset) -> list[Warning]:
+def _of_answers(evidence: Evidence, answers: xr.Dataset, scores: xr.Dataset) -> list[Caution]:
     found, question = [], answers["question"].values
     against = question[answers["margin"].values < 0]
     if against.size:
         found.append(
-            Warning(
+            Caution(
                 f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
                 "See the pictures below. Mistaken answers: allow for them with --lapse-rate 0.1 (now "
                 f"{evidence.settings.lapse_rate:g}). Right ones: the features cannot tell what matters; use more "
@@ -146,7 +146,7 @@ def _of_answers(evidence: Evidence, answers: xr.Dataset, scores: xr.Dataset) -> 
     surprising = question[answers["before"].values < SURPRISING]
     if surprising.size:
         found.append(
-            Warning(
+            Caution(
                 f"{count(surprising.size, 'answer came', 'answers came')} as a surprise (probability below "
                 f"{SURPRISING:g} beforehand): {_list(surprising)}.",
                 "Some are to be expected: of predictions of 0.9 one in ten fails. See by the pictures whether they "
@@ -157,7 +157,7 @@ def _of_answers(evidence: Evidence, answers: xr.Dataset, scores: xr.Dataset) -> 
         scores["log_score_expected"] - 2 * scores["log_score_sd"]
     ):
         found.append(
-            Warning(
+            Caution(
                 "The predictions were surer than they should have been (log score more than two standard deviations "
                 "below what they promise).",
                 "A lapse rate, a lower --steepness or smoother features make it less sure.",
@@ -166,7 +166,7 @@ def _of_answers(evidence: Evidence, answers: xr.Dataset, scores: xr.Dataset) -> 
     ties = sum(record.answer is Answer.TIE for record in evidence.answers)
     if ties > 0.3 * max(3, len(evidence.answers)):
         found.append(
-            Warning(
+            Caution(
                 f"{ties} of {len(evidence.answers)} answers were ties, which give the posterior nothing.",
                 "Longer or more different trajectories are easier to tell apart.",
             )
