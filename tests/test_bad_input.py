@@ -1,0 +1,152 @@
+"""What of the user's goes wrong in the middle of a run is named, and the run on disk goes on once it is mended."""
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete, MultiDiscrete, Tuple
+
+import bayespbrl
+from bayespbrl import ReturnExpert, runs
+from bayespbrl.policies import LinearGaussianPolicy
+
+STEPS = 5
+QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": STEPS, "evaluation_episodes": 4, "centres": 20}
+# 10 trajectories of an iteration, then 4 of its evaluation, and so on
+AN_ITERATION = (10 + 4) * STEPS
+
+
+class Slope(gymnasium.Env):
+    """A point pushed along a line; goes wrong at the n-th step of its life if told so."""
+
+    observation_space = Box(-10.0, 10.0, (2,), dtype=np.float64)
+    action_space = Box(-1.0, 1.0, (1,), dtype=np.float64)
+
+    def __init__(self, fault=None, at=None):
+        self.fault, self.at, self.life = fault, at, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.position = self.np_random.normal(0, 0.1, 2)
+        return self.position.copy(), {}
+
+    def step(self, action):
+        self.life += 1
+        fault = self.fault if self.life == self.at else None
+        if fault == "raises":
+            raise RuntimeError("the motor is on fire")
+        self.position = self.position + 0.3 * float(action[0]) + self.np_random.normal(0, 0.02, 2)
+        seen = np.full(2, np.nan) if fault == "observation" else self.position.copy()
+        return seen, np.nan if fault == "reward" else float(self.position.sum()), False, False, {}
+
+
+def features(states):
+    return np.column_stack([states, states**2])
+
+
+class Faulty:
+    """A function of the user's that does something else from its n-th call on, until it is mended."""
+
+    def __init__(self, right, wrong, calls):
+        self.right, self.wrong, self.calls = right, wrong, calls
+
+    def __call__(self, *arguments):
+        self.calls -= 1
+        return self.right(*arguments) if self.calls >= 0 else self.wrong(*arguments)
+
+
+def own_parts():
+    return {"features": features, "policy": LinearGaussianPolicy.initial(Slope.observation_space, Slope.action_space)}
+
+
+def fingerprint(learner):
+    """What must come out the same, bit for bit."""
+    return (
+        [{name: value for name, value in summary.items() if name != "seconds"} for summary in learner.iterations],
+        [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
+        learner.preferences,
+        np.asarray(learner.estimate.weights).tobytes(),
+    )
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """The run in which nothing went wrong."""
+    return fingerprint(bayespbrl.Learner(Slope(), **own_parts(), **QUICK).run(ReturnExpert()))
+
+
+def stopped(directory, message, *, env=None, expert=None, **parts):
+    """A run on disk that stops with an error; nothing in it is half-written."""
+    learner = runs.start(env or Slope(), directory, **(own_parts() | parts), **QUICK)
+    with pytest.raises(ValueError, match=message):
+        learner.run(expert or ReturnExpert())
+    assert not list(directory.rglob("*.part"))
+    return learner
+
+
+def goes_on(directory, completed, straight):
+    """Mended, the run goes on from its last complete iteration and ends as if nothing had gone wrong."""
+    learner = runs.resume(directory, env=Slope(), **own_parts())
+    assert learner.state.iteration == completed
+    assert fingerprint(learner.run(ReturnExpert())) == straight
+    assert fingerprint(bayespbrl.load(directory, env=Slope(), **own_parts()).learner) == straight
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("observation", "environment Slope: expected finite observations and rewards, got NaN or infinity at step 3"),
+        ("reward", "environment Slope: expected finite observations and rewards, got NaN or infinity at step 3"),
+        ("raises", "environment Slope failed at step 3: RuntimeError: the motor is on fire"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("at", "completed"),
+    [(3, 0), (10 * STEPS + 3, 0), (AN_ITERATION + 3, 1), (AN_ITERATION + 10 * STEPS + 3, 1)],
+    ids=["first trajectory", "first evaluation", "second iteration", "second evaluation"],
+)
+def test_an_environment_that_fails_in_the_middle_of_a_trajectory(tmp_path, straight, fault, message, at, completed):
+    stopped(tmp_path / "run", message, env=Slope(fault, at))
+    goes_on(tmp_path / "run", completed, straight)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda states: states[:, 0], r"features Faulty: expected shape \(\d+, D\), got \(\d+,\)"),
+        (lambda states: features(states)[1:], r"features Faulty: expected shape \(\d+, D\), got \(\d+, 4\)"),
+        (lambda states: np.zeros((len(states), 0)), r"features Faulty: expected shape \(\d+, D\), got \(\d+, 0\)"),
+        (lambda states: features(states).astype(str), "features Faulty: expected real numbers, got <U"),
+        (lambda states: features(states) * np.inf, "features Faulty: expected finite numbers, got NaN or infinity"),
+        (lambda states: None, r"features Faulty: expected shape \(\d+, D\), got \(\)"),
+    ],
+)
+def test_features_of_the_wrong_shape_or_kind(tmp_path, straight, wrong, message):
+    calls = 0
+
+    def counted(states):
+        nonlocal calls
+        calls += 1
+        return features(states)
+
+    one = bayespbrl.Learner(Slope(), **(own_parts() | {"features": counted}), **(QUICK | {"iterations": 1}))
+    one.run(ReturnExpert())
+    stopped(tmp_path / "run", message, features=Faulty(features, wrong, calls + 1))
+    goes_on(tmp_path / "run", 1, straight)
+
+
+@pytest.mark.parametrize("answer", ["perhaps", None, 1, ["first"], np.nan, True])
+def test_an_expert_that_returns_nonsense(tmp_path, straight, answer):
+    expert = Faulty(ReturnExpert(), lambda first, second: answer, 3)
+    stopped(tmp_path / "run", "expert: expected one of 'first', 'second', 'tie', .*, got ", expert=expert)
+    goes_on(tmp_path / "run", 2, straight)
+
+
+@pytest.mark.parametrize("space", [MultiDiscrete([2, 3]), Tuple([Discrete(2)])])
+@pytest.mark.parametrize("kind", ["observation", "action"])
+def test_an_environment_with_an_unsupported_space_leaves_nothing_behind(tmp_path, kind, space):
+    env = Slope()
+    setattr(env, f"{kind}_space", space)
+    with pytest.raises(ValueError, match=rf"environment Slope: expected a Discrete or .*Box {kind} space, got "):
+        runs.start(env, tmp_path / "run", **QUICK)
+    assert list(tmp_path.iterdir()) == []
