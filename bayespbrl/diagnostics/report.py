@@ -126,6 +126,7 @@ def _facts(evidence: Evidence) -> list[tuple[str, str]]:
         ("discount γ", f"{settings.discount:g}"),
         ("policy", settings.policy),
         ("expert", expert),
+        *((name, str(getattr(settings, name))) for name in ("schedule", "query") if hasattr(settings, name)),
     ]
 
 

@@ -15,12 +15,13 @@ from PIL import Image
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG with its caption and a text for who cannot see it; `name` is that of its file where it gets one."""
+    """A PNG of so many inches' width, its caption, and a text for who cannot see it; `name` is its file's."""
 
     name: str
     png: bytes
     caption: str
     alt: str
+    inches: float = 0.0
     kind: str = "picture"
 
     @property
@@ -87,7 +88,7 @@ def drawn(
         axes.set_title(title, fontsize=10)
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
-    return Picture(name, _png(figure, dpi=130, colours=256), caption, alt)
+    return Picture(name, _png(figure, dpi=150, colours=256), caption, alt, columns * size[0])
 
 
 def thumbnail(name: str, draw: Callable[[Axes], Any], caption: str, alt: str) -> Picture:

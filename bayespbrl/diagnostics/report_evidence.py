@@ -23,6 +23,8 @@ from bayespbrl.runs import RunDirectory, read_parts, read_summary
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory, trajectory_features
 
+WITHOUT_POSTERIOR = ("linear-program", "known-reward")
+
 
 @dataclass(frozen=True)
 class AnswerRecord:
@@ -180,7 +182,7 @@ class _Reader:
     def _predicted(self, record: AnswerRecord) -> AnswerRecord:
         numbers = (record.first, record.second)
         both = [self.trajectories[number] for number in numbers if number in self.trajectories]
-        if self.log.settings.utility not in ("posterior-mean", "most-likely") or len(both) < 2:
+        if self.log.settings.utility in WITHOUT_POSTERIOR or len(both) < 2:
             return record
         if self.estimate is None:
             probability = 0.5  # before any answer, the prior says nothing of which is better

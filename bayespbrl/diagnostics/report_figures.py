@@ -82,7 +82,7 @@ def plot_entropy(table: xr.Dataset, axes: Axes) -> Axes:
 def plot_column(table: xr.Dataset, name: str, axes: Axes) -> Axes:
     """Any one number of each iteration."""
     _series(table, axes, {name: name})
-    axes.set(ylabel=name)
+    axes.set(ylabel=name.replace("_", " "))
     return axes
 
 
@@ -128,8 +128,9 @@ def plot_states(table: xr.Dataset, values: np.ndarray, axes: Axes, *, label: str
 
 def plot_state_bands(table: xr.Dataset, axes: Axes) -> Axes:
     """Mean utility of each state with two standard deviations either way: of states in a list or on a line."""
-    states, mean = table["states"].values.reshape(table.sizes["state"]), table["mean"].values
-    sd = table["sd"].values if "sd" in table else np.zeros(len(mean))
+    states, certain = table["states"].values.reshape(table.sizes["state"]), "sd" not in table
+    mean = table["used" if certain else "mean"].values
+    sd = np.zeros(len(mean)) if certain else table["sd"].values
     if table.attrs["kind"] == "line":
         axes.fill_between(states, mean - 2 * sd, mean + 2 * sd, alpha=0.25, linewidth=0, label="± 2 sd")
         axes.plot(states, mean, color=SETTLED, label="mean")

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.diagnostics.report_evidence import Evidence
+from bayespbrl.diagnostics.report_evidence import WITHOUT_POSTERIOR, Evidence
 from bayespbrl.diagnostics.report_tables import return_draws
 
 
@@ -81,7 +81,7 @@ def cell(value: Any) -> str:
 def no_posterior(evidence: Evidence) -> str:
     """Why there is none."""
     kind = evidence.settings.utility
-    if evidence.estimate is None and kind in ("posterior-mean", "most-likely"):
+    if evidence.estimate is None and kind not in WITHOUT_POSTERIOR:
         return "No posterior yet." if not evidence.iterations else "No posterior can be read."
     return f"This run's utility is {kind}, which has no posterior: there is no uncertainty to show."
 

@@ -11,7 +11,7 @@ from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ran
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.prequential import plot_calibration
 from bayespbrl.diagnostics.report_document import Section, Table, drawn
-from bayespbrl.diagnostics.report_evidence import Evidence
+from bayespbrl.diagnostics.report_evidence import WITHOUT_POSTERIOR, Evidence
 from bayespbrl.diagnostics.report_findings import cell, figure, no_posterior
 from bayespbrl.diagnostics.report_tables import thinned
 
@@ -78,7 +78,7 @@ def fits(evidence: Evidence, iterations: xr.Dataset) -> Section:
 def calibration(evidence: Evidence, scores: xr.Dataset) -> Section:
     """Whether the predicted probabilities can be trusted."""
     title = "Are its probabilities right?"
-    if evidence.settings.utility not in ("posterior-mean", "most-likely"):
+    if evidence.settings.utility in WITHOUT_POSTERIOR:
         return Section("calibration", title, [no_posterior(evidence)])
     number = scores.sizes["prediction"]
     if not number:

@@ -103,10 +103,10 @@ def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
     """The utility over the state space.
 
     Returns:
-      along `state`: `mean`, `sd` of the posterior and `prior_sd`, all in the units of the weights; `draws` (draw,
-      state), three of them; `states`, the observations; `visits`, how often each was seen (discrete states); `reached`,
-      whether φ is more than next to nothing there, as it is not far from every centre. sd, prior_sd and draws only
-      where there is a posterior.
+      along `state`: `used`, what the learner took for the utility; where there is a posterior, its `mean` and `sd`,
+      `prior_sd`, and `draws` (draw, state), three of them; all in the units of the weights; `states`, the observations;
+      `visits`, how often each was seen (discrete states); `reached`, whether φ is more than next to nothing there, as
+      it is not far from every centre.
 
       The attribute `kind` says what the states are: `grid` (the cells, row by row, of an environment that has a
       `grid_shape`), `list` (discrete), `line` and `plane` (evenly spaced over what was observed in one or two
@@ -122,7 +122,7 @@ def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
     shown, attrs = _states_to_show(evidence, states, np.random.default_rng(seed))
     features = estimate.features(shown)
     lengths = np.linalg.norm(features, axis=1)
-    data: dict[str, Any] = {"mean": ("state", features @ estimate.weights)}
+    data: dict[str, Any] = {"used": ("state", features @ estimate.weights)}
     data["reached"] = ("state", lengths > 0.01 * np.max(lengths, initial=0.0))
     data["states"] = (("state",) if shown.ndim == 1 else ("state", "observation"), shown)
     if states.ndim == 1:
@@ -130,7 +130,8 @@ def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
     if evidence.posterior is not None:
         draws = _weights(evidence) @ features.T / estimate.scale
         chosen = np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)
-        data["sd"] = ("state", draws.std(axis=0))
+        mean = np.asarray(evidence.posterior["utility_weights_mean"]) / estimate.scale
+        data["mean"], data["sd"] = ("state", features @ mean), ("state", draws.std(axis=0))
         data["draws"] = (("draw", "state"), draws[chosen])
         scale = float(evidence.posterior.attrs["prior_scale"]) / estimate.scale
         data["prior_sd"] = ("state", scale * lengths)

@@ -59,17 +59,25 @@ def _maps(table: xr.Dataset) -> list[Picture]:
         caption = f"Utility {where}: mean, and two posterior standard deviations either way. The scale is free."
         return [drawn("utility", panels, caption, f"Utility {where}.", columns=1, size=(7.6, 3.2))]
     blank = np.where(table["reached"].values, 0.0, np.nan)
-    mean = table["mean"].values + blank
-    panels = [("Mean", partial(figures.plot_states, table, mean, label="utility", cmap="viridis"))]
-    caption = f"The utility {where}: its posterior mean"
+    shown = [("used", "As the learner used it", "utility", "viridis")]
+    caption = f"The utility {where}. The scale is free."
     if "sd" in table:
-        spread = table["sd"].values + blank
-        panels.append(("Standard deviation", partial(figures.plot_states, table, spread, label="sd", cmap="magma")))
-        caption += ", and its standard deviation, bright where it does not know"
-    caption += ". The scale is free."
+        table = table.assign(left=table["sd"] / table["prior_sd"].where(table["reached"]))
+        shown = [("mean", "Mean", "utility", "viridis"), ("sd", "Standard deviation", "sd", "magma")]
+        shown += [("left", "Share of the prior left", "sd / prior sd", "magma")]
+        caption = (
+            f"The utility {where}: its posterior mean; its standard deviation, which is small also where the features "
+            "are; and how much of the prior's is left, dark where something was learnt. The scale is free."
+        )
+        if not np.array_equal(table["used"], table["mean"]):
+            shown.append(("used", "As the learner used it", "utility", "viridis"))
     if np.isnan(blank).any():
         caption += " Grey: too far from every centre of the features for the utility to be anything but zero."
-    blocks = [drawn("utility", panels, caption, f"Map of the utility {where}.")]
+    panels = [
+        (title, partial(figures.plot_states, table, table[name].values + blank, label=label, cmap=colours))
+        for name, title, label, colours in shown
+    ]
+    blocks = [drawn("utility", panels, caption, f"Map of the utility {where}.", columns=3, size=(3.5, 2.9))]
     if "draws" in table:
         draws = table["draws"].values
         limits: dict[str, Any] = {"vmin": float(draws.min()), "vmax": float(draws.max()), "cmap": "viridis"}
