@@ -1,0 +1,267 @@
+"""From draws of the weights to returns, rankings, Q and greedy actions: on cases that can be written down."""
+
+import itertools
+
+import jax
+import matplotlib.pyplot
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from bayespbrl import Learner, ReturnExpert
+from bayespbrl.diagnostics.uncertainty import (
+    greedy_probabilities,
+    plot_greedy,
+    plot_q,
+    plot_ranking,
+    plot_returns,
+    q_draws,
+    ranking_probabilities,
+    return_draws,
+    successor_features,
+)
+from bayespbrl.features import OneHot
+from bayespbrl.improvement import estimate_q
+from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
+from bayespbrl.utility import estimate_utility
+
+
+def staying(state, steps=4):
+    return Trajectory(np.full(steps + 1, state), np.zeros(steps, dtype=int), np.zeros(steps))
+
+
+TRAJECTORIES = [staying(0), staying(1), staying(2)]
+
+
+def fitted(pairs=((2, 1),), method="posterior-mean"):
+    return estimate_utility(TRAJECTORIES, pairs, OneHot(3), method=method, discount=0.9)
+
+
+def given_returns(values):
+    """Draws (S, n) as two chains of a data set."""
+    draws = np.reshape(values, (2, -1, np.shape(values)[1]))
+    return xr.Dataset({"returns": (("chain", "draw", "trajectory"), draws)}, {"trajectory": range(draws.shape[2])})
+
+
+def given_q(values):
+    """Draws (S, states, actions) as one chain of a data set."""
+    return xr.Dataset(
+        {"q": (("chain", "draw", "state", "action"), np.asarray(values, dtype=float)[None])},
+        {"action": [10, 20, 30]},
+        {"converged": 0},
+    )
+
+
+# Draws.
+
+
+def test_draws_of_returns_are_draws_of_the_weights_times_feature_sums():
+    estimate = fitted()
+    sums = trajectory_features(TRAJECTORIES, OneHot(3), discount=0.9)
+    weights = estimate.posterior["posterior"]["utility_weights"].values / estimate.scale
+    all_of_them = return_draws(estimate, TRAJECTORIES, number=10**9)["returns"]
+    np.testing.assert_allclose(all_of_them, weights @ sums.T, rtol=1e-12)
+    some = return_draws(estimate, TRAJECTORIES, number=100)
+    assert some["returns"].sizes["chain"] * some["returns"].sizes["draw"] <= 100
+    assert np.isin(some["returns"].values, all_of_them.values).all()
+    assert (some.attrs["converged"], some.attrs["rhat_max"]) == (1, estimate.quality.rhat_max)
+
+
+def test_the_probability_to_be_better_matches_quadrature_over_the_only_margin():
+    # One answer, 2 ≻ 1: with the differences scaled to (0, −1, 1) and K = 1 the margin is √2 z, z ~ N(0, 1), and the
+    # posterior density of z ∝ N(z) sigmoid(5 √2 z).
+    z = np.linspace(-10, 10, 20001)
+    density = np.exp(-0.5 * z**2) / (1 + np.exp(-5 * np.sqrt(2) * z))
+    exact = density[z > 0].sum() / density.sum()
+    ranking = ranking_probabilities(return_draws(fitted(), TRAJECTORIES, number=4000))
+    assert float(ranking["better_probability"][2, 1]) == pytest.approx(exact, abs=0.02)
+    # 0 was never compared, and w → −w with 1 and 2 exchanged leaves the posterior as it is
+    assert float(ranking["better_probability"][0, 1] + ranking["better_probability"][0, 2]) == pytest.approx(
+        1.0, abs=0.05
+    )
+
+
+# Rankings.
+
+
+def test_the_ranking_counts_draws():
+    ranking = ranking_probabilities(given_returns([[3, 2, 1], [3, 1, 2], [1, 2, 3], [9, 8, -7]]))
+    np.testing.assert_allclose(ranking["rank_probability"], [[0.75, 0, 0.25], [0, 0.75, 0.25], [0.25, 0.25, 0.5]])
+    np.testing.assert_allclose(ranking["best_probability"], [0.75, 0, 0.25])
+    np.testing.assert_allclose(ranking["expected_rank"], [1.5, 2.25, 2.25])
+    np.testing.assert_allclose(ranking["better_probability"], [[0.5, 0.75, 0.75], [0.25, 0.5, 0.5], [0.25, 0.5, 0.5]])
+    assert ranking["rank"].values.tolist() == [1, 2, 3]
+
+
+def test_equal_returns_share_their_ranks():
+    ranking = ranking_probabilities(given_returns([[5, 5, 1, 5], [2, 0, 0, 3]]))
+    np.testing.assert_allclose(ranking["rank_probability"][0], np.array([1 / 3, 1 / 3 + 1, 1 / 3, 0]) / 2)
+    np.testing.assert_allclose(ranking["rank_probability"][2], np.array([0, 0, 1 / 2, 1 + 1 / 2]) / 2)
+    np.testing.assert_allclose(ranking["expected_rank"], [2, 2.75, 3.75, 1.5])
+    np.testing.assert_allclose(ranking["better_probability"][0], [0.5, 0.75, 1.0, 0.25])
+
+
+def test_ranks_of_random_draws_agree_with_sorting_and_every_row_and_column_is_a_distribution():
+    draws = np.random.default_rng(2).normal(size=(500, 6)) + np.linspace(0, 1, 6)
+    ranking = ranking_probabilities(given_returns(draws))
+    places = np.argsort(np.argsort(-draws, axis=1), axis=1)
+    table = ranking["rank_probability"].values
+    for trajectory, rank in itertools.product(range(6), repeat=2):
+        assert table[trajectory, rank] == pytest.approx(np.mean(places[:, trajectory] == rank), abs=1e-12)
+    np.testing.assert_allclose(table.sum(axis=0), 1)
+    np.testing.assert_allclose(table.sum(axis=1), 1)
+    pairs = ranking["better_probability"].values
+    np.testing.assert_allclose(pairs + pairs.T, 1)
+    np.testing.assert_allclose(ranking["expected_rank"], 1 + (1 - pairs).sum(axis=1) - 0.5)  # how many are better
+
+
+# Q.
+
+
+@pytest.fixture(scope="module")
+def grid():
+    """Thirty trajectories of a uniform policy and the policy that follows from two answers."""
+    learner = Learner("gridworld", iterations=1, trajectories_per_iteration=30, evaluation_episodes=1, seed=3)
+    return learner.run(ReturnExpert())
+
+
+def test_successor_features_are_the_discounted_visits_to_come_under_the_observed_frequencies(grid):
+    steps, table, discount = transitions(grid.trajectories), grid.policy.table, grid.settings.discount
+    counts = np.zeros((125, 25))
+    np.add.at(counts, (steps.states * 5 + steps.actions, steps.next_states), 1)
+    assert (counts.sum(axis=1) > 0).all()
+    frequencies = counts / counts.sum(axis=1, keepdims=True)  # P̂(s′|s, a)
+    following = (frequencies[:, :, None] * table).reshape(125, 125)
+    exact = np.linalg.solve(np.eye(125) - discount * following, frequencies)
+    states, actions = np.divmod(np.arange(125), 5)
+    found = successor_features(grid)(states, actions)
+    np.testing.assert_allclose(found, exact, atol=1e-4 / (1 - discount))
+    np.testing.assert_allclose(found.sum(axis=1), 1 / (1 - discount), rtol=1e-5)  # one visit a step, for ever
+
+
+def test_draws_of_q_are_draws_of_the_weights_times_successor_features(grid):
+    states, actions = np.array([0, 12, 24]), np.arange(5)
+    successors = successor_features(grid)
+    q = q_draws(grid.estimate, successors, states, actions, number=10**9)["q"]
+    assert q.dims == ("chain", "draw", "state", "action")
+    weights = grid.estimate.posterior["posterior"]["utility_weights"].values / grid.estimate.scale
+    for (i, state), action in itertools.product(enumerate(states), actions):
+        row = successors(np.array([state]), np.array([action]))[0]
+        np.testing.assert_allclose(q[:, :, i, action], weights @ row, rtol=1e-9, atol=1e-9)
+
+
+CONTINUOUS = {
+    "iterations": 1,
+    "max_steps": 10,
+    "trajectories_per_iteration": 4,
+    "evaluation_episodes": 2,
+    "centres": 15,
+    "policy": "linear-gaussian",
+}
+
+
+def test_q_of_any_weights_is_what_lstd_gives_for_their_utilities():
+    learner = Learner("swing-up", **CONTINUOUS, seed=5).run(ReturnExpert())
+    successors = successor_features(learner, seed=2)
+    steps = transitions(learner.trajectories)
+    weights = np.random.default_rng(0).normal(size=len(learner.estimate.weights))
+    alone = estimate_q(
+        learner.policy,
+        steps,
+        learner.estimate.features(steps.next_states) @ weights,
+        key=jax.random.key(2),
+        action_space=learner.environment.action_space,
+        features=successors.features,
+        discount=learner.settings.discount,
+        fixed_point_ridge=learner.settings.fixed_point_ridge,
+        projection_ridge=learner.settings.projection_ridge,
+    )
+    expected = alone(steps.states, steps.actions)
+    found = successors(steps.states, steps.actions) @ weights
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    forces = np.linspace(-30, 30, 7)[:, None]
+    q = q_draws(learner.estimate, successors, steps.states[:3], forces, number=200)
+    assert q["q"].shape == (4, 50, 3, 7)
+    np.testing.assert_array_equal(q["action"], forces[:, 0])
+    greedy = greedy_probabilities(q)
+    np.testing.assert_allclose(greedy["greedy_probability"].sum("action"), 1)
+    assert np.isin(greedy["greedy_of_mean"], forces).all()
+
+
+def test_the_greedy_action_is_counted_over_draws_and_equal_ones_share():
+    # Two states, four draws. The mean of the first is greedy for the third action, which is the best in one draw only.
+    first = [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 9]]
+    second = [[2, 2, 0], [2, 2, 0], [2, 2, 0], [0, 0, 0]]
+    greedy = greedy_probabilities(given_q(np.stack([first, second], axis=1)))
+    np.testing.assert_allclose(greedy["greedy_probability"][0], [0.5, 0.25, 0.25])
+    np.testing.assert_allclose(greedy["greedy_probability"][1], np.array([3 / 2, 3 / 2, 0]) / 4 + 1 / 12)
+    assert greedy["greedy_of_mean"].values.tolist() == [30, 10]
+    np.testing.assert_allclose(greedy["expected_loss"], [(1 + 1 + 1 + 0) / 4, 0])
+    assert greedy.attrs["converged"] == 0
+
+
+# Figures.
+
+
+def test_figures_are_drawn_on_the_axes_given_and_on_no_other():
+    figure = Figure()
+    axes = figure.subplots(1, 5)
+    returns = given_returns([[3, 2, 1], [3, 1, 2], [1, 2, 3], [9, 8, -7]])
+    q = given_q(np.random.default_rng(0).normal(size=(20, 2, 3)))
+    assert plot_returns(returns, axes[0]) is axes[0]
+    assert plot_ranking(ranking_probabilities(returns), axes[1]) is axes[1]
+    assert plot_q(q, axes[2], state=1) is axes[2]
+    assert plot_greedy(greedy_probabilities(q), axes[3]) is axes[3]
+    FigureCanvasAgg(figure).draw()
+    assert not axes[4].has_data()
+    assert [a.get_title() for a in axes[2:4]] == [
+        "Q in state 1 (the fit has not converged)",
+        "Best action (the fit has not converged)",
+    ]
+    assert axes[0].get_title() == "Returns"
+    assert [label.get_text() for label in axes[1].get_yticklabels()] == ["0 (75%)", "1 (0%)", "2 (25%)"]
+    assert [label.get_text() for label in axes[3].get_xticklabels()] == ["10", "20", "30"]
+    assert matplotlib.pyplot.get_fignums() == []
+
+
+def test_a_level_that_all_have_in_common_is_left_out_of_the_figures():
+    # the returns of each draw differ by 1 and 2, whatever the level, so all intervals are points
+    levels = np.random.default_rng(0).normal(scale=100, size=(10, 1))
+    axes = plot_returns(given_returns(levels + np.array([0.0, 2.0, 1.0])), Figure().subplots())
+    lines = [segment[:, 0] for collection in axes.collections for segment in collection.get_segments()]
+    np.testing.assert_allclose(np.ptp(lines, axis=1), 0, atol=1e-12)
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["0", "2", "1"]  # from the bottom upwards
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize("method", ["linear-program", "known-reward"])
+def test_an_estimate_without_a_posterior_is_refused(method):
+    estimate = fitted(method=method)
+    with pytest.raises(ValueError, match=r"estimate: expected one with a posterior, got .* without"):
+        return_draws(estimate, TRAJECTORIES)
+    with pytest.raises(ValueError, match="estimate: expected one with a posterior"):
+        q_draws(estimate, None, np.arange(2), np.arange(2))
+
+
+def test_a_learner_before_its_first_iteration_has_no_successor_features():
+    with pytest.raises(ValueError, match="estimate: expected one with a posterior, got NoneType without"):
+        successor_features(Learner("gridworld"))
+
+
+@pytest.mark.parametrize(("states", "actions"), [([], [1]), ([1], []), (1, [1]), ([1], 1)])
+def test_no_states_or_no_actions_are_refused(states, actions):
+    with pytest.raises(ValueError, match="states, actions: expected at least one row each"):
+        q_draws(fitted(), None, states, actions)
+
+
+def test_no_trajectories_no_draws_and_a_state_that_there_is_not_are_refused():
+    with pytest.raises(ValueError, match="trajectory_features: expected at least one trajectory"):
+        return_draws(fitted(), [])
+    with pytest.raises(ValueError, match="number: expected at least 1 draw, got 0"):
+        return_draws(fitted(), TRAJECTORIES, number=0)
+    with pytest.raises(ValueError, match=r"state: expected a number in 0 … 1, got 2"):
+        plot_q(given_q(np.zeros((4, 2, 3))), Figure().subplots(), state=2)
