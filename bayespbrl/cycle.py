@@ -207,7 +207,7 @@ class Learner:
         """Steps 1 and 2, and the value of the new policy, which the learner does not see."""
         state, settings = self.state, self.settings
         clock = [time.perf_counter()]
-        estimate = self._estimate()
+        estimate, choice = self._estimate()
         clock.append(time.perf_counter())
         steps = transitions(state.trajectories)
         update = self._update(estimate, steps)
@@ -222,6 +222,7 @@ class Learner:
         clock.append(time.perf_counter())
         seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
         summary = _summary(state, estimate, update, evaluated, seconds)
+        summary["hyperparameters"] = None if choice is None else choice.summary()
         size = settings.trajectories_per_iteration
         self._record(
             {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
@@ -230,20 +231,30 @@ class Learner:
             estimate=estimate,
         )
 
-    def _estimate(self) -> Any:
-        settings = self.settings
-        return utility.estimate_utility(
-            self.state.trajectories,
-            self.state.preferences.pairs,
-            self._state_features(self._rng(FEATURES, 2 * self.state.iteration)),
-            method=settings.utility,
-            discount=settings.discount,
-            prior_scale=settings.prior_scale,
-            steepness=settings.steepness,
-            lapse_rate=settings.lapse_rate,
-            likelihood=settings.likelihood,
-            seed=int(self._rng(FIT, self.state.iteration).integers(2**31)),
+    def _estimate(self) -> tuple[Any, utility.HyperparameterChoice | None]:
+        """Step 1, after the answers have said which length scales they speak for."""
+        settings, state = self.settings, self.state
+        pairs = state.preferences.pairs
+        features = self._state_features(
+            self._rng(FEATURES, 2 * state.iteration), bandwidth_factor=settings.utility_bandwidth_factor
         )
+        model: dict[str, Any] = {name: getattr(settings, name) for name in ("steepness", "lapse_rate")}
+        fixed: dict[str, Any] = {name: getattr(settings, name) for name in ("discount", "prior_scale", "likelihood")}
+        choice = None
+        if settings.hyperparameters == "evidence" and settings.utility != "known-reward":
+            choice = utility.choose_hyperparameters(state.trajectories, pairs, features, **model, **fixed)
+            features = choice.features
+            model = {"steepness": choice.steepness, "lapse_rate": choice.lapse_rate}
+        estimate = utility.estimate_utility(
+            state.trajectories,
+            pairs,
+            features,
+            method=settings.utility,
+            seed=int(self._rng(FIT, state.iteration).integers(2**31)),
+            **model,
+            **fixed,
+        )
+        return estimate, choice
 
     def _update(self, estimate: Any, steps: Any) -> improvement.Improvement:
         settings, iteration = self.settings, self.state.iteration
@@ -265,7 +276,7 @@ class Learner:
             key=self._key(IMPROVE, iteration),
             rng=self._rng(IMPROVE, iteration),
             action_space=self.environment.action_space,
-            state_features=self._state_features(rng),
+            state_features=self._state_features(rng, bandwidth_factor=settings.bandwidth_factor),
             state_action_features=state_action_features,
             kl_bound=settings.kl_bound,
             discount=settings.discount,
@@ -280,7 +291,7 @@ class Learner:
         trajectories = self.state.trajectories if recent is None else self.state.trajectories[-recent * size :]
         return np.concatenate([trajectory.states[:-1] for trajectory in trajectories])
 
-    def _state_features(self, rng: np.random.Generator) -> utility.StateFeatures:
+    def _state_features(self, rng: np.random.Generator, *, bandwidth_factor: float) -> utility.StateFeatures:
         """φ(s): the user's, or drawn anew at states observed so far."""
         if self.features is not None:
             features = self.features
@@ -291,7 +302,7 @@ class Learner:
             observed,
             rng=rng,
             number_of_centres=self.settings.centres,
-            bandwidth_factor=self.settings.bandwidth_factor,
+            bandwidth_factor=bandwidth_factor,
             period=self._period,
         )
 

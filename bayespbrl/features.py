@@ -6,7 +6,8 @@ observations; `checked_features` calls it.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from gymnasium import Space
@@ -60,6 +61,10 @@ class RadialBasis:
         """Features of observations of shape (N, S); shape (N, D)."""
         observations = _vectors("observations", observations, self.centres.shape[1])
         return radial_basis(observations, self.centres, self.bandwidths, self.period)
+
+    def rescaled(self, multiples: ArrayLike) -> Self:
+        """The same centres with bandwidths `multiples` times as wide, one number or one a dimension."""
+        return replace(self, bandwidths=self.bandwidths * np.asarray(multiples))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ LIKELIHOODS = ("mixed", "logistic", "probit")
 EXPERTS = ("return", "terminal", "other")
 POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
 FEATURES = ("drawn", "other")
+HYPERPARAMETERS = ("evidence", "given")
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,9 @@ class Settings:
       prior_scale: σ, the prior's standard deviation of each utility weight.
       steepness: m of the likelihood, for differences divided by their largest absolute entry.
       lapse_rate: λ, the probability that an answer is a coin toss, in [0, 1).
+      hyperparameters: whether the utility's length scales, the steepness and the lapse rate are chosen each iteration
+        by the `evidence` of the answers, beginning at the given ones, or are the `given` ones.
+      utility_bandwidth_factor: multiplies the median rule for the utility's features.
       seed: of every random choice of the run.
       trajectories_per_iteration: N.
       queries_per_iteration, first_queries: M, in later iterations and in the first.
@@ -51,6 +55,8 @@ class Settings:
     prior_scale: float = 1.0
     steepness: float = 5.0
     lapse_rate: float = 0.0
+    hyperparameters: str = "evidence"
+    utility_bandwidth_factor: float = 1.0
     seed: int = 0
     trajectories_per_iteration: int = 10
     queries_per_iteration: int = 1
@@ -74,7 +80,15 @@ class Settings:
         _one_of("likelihood", self.likelihood, LIKELIHOODS)
         _one_of("policy", self.policy, POLICIES)
         _one_of("features", self.features, FEATURES)
-        for name in ("kl_bound", "prior_scale", "steepness", "bandwidth_factor", "initial_action_scale"):
+        _one_of("hyperparameters", self.hyperparameters, HYPERPARAMETERS)
+        for name in (
+            "kl_bound",
+            "prior_scale",
+            "steepness",
+            "bandwidth_factor",
+            "utility_bandwidth_factor",
+            "initial_action_scale",
+        ):
             _number(name, getattr(self, name), lambda value: value > 0, "a positive finite number")
         for name in ("fixed_point_ridge", "projection_ridge"):
             _number(name, getattr(self, name), lambda value: value >= 0, "a non-negative finite number")

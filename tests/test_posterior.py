@@ -7,7 +7,15 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from bayespbrl.diagnostics.convergence import convergence
-from bayespbrl.models import Candidate, posterior, restored, sample_posterior, select_hyperparameters, stored
+from bayespbrl.models import (
+    Candidate,
+    posterior,
+    restored,
+    sample_posterior,
+    search_hyperparameters,
+    select_hyperparameters,
+    stored,
+)
 from bayespbrl.models.likelihoods import Mixed, log_prob
 from bayespbrl.models.low_rank import low_rank
 from bayespbrl.models.posterior import _ellipses, _run, fit_gaussian
@@ -274,6 +282,43 @@ def test_evidence_finds_the_length_scale_that_ordered_the_pairs():
     assert result.best == 1
     assert result.weights[1] > 0.9
     np.testing.assert_allclose(result.weights.sum(), 1)
+
+
+def test_the_climb_ends_where_no_neighbour_on_the_grid_is_more_likely_and_finds_a_length_scale_for_each_dimension():
+    rng = np.random.default_rng(3)
+    points, centres = rng.uniform(-3, 3, (160, 2)), rng.uniform(-3, 3, (150, 2))
+
+    def features(scales):
+        return np.exp(-0.5 * (((points[:, None] - centres) / scales) ** 2).sum(axis=2))
+
+    true_scales = np.array([0.7, 20.0])
+    utility = features(true_scales) @ rng.normal(size=150)
+
+    def candidate(point):
+        rows = features(np.array(point[:2]))
+        difference = (rows[:80] - rows[80:]) * np.sign(utility[:80] - utility[80:])[:, None]
+        return Candidate(difference / np.abs(difference).max(), steepness=point[2])
+
+    axes = [(0.05, 0.7, 5.0, 20.0), (0.05, 0.7, 5.0, 20.0), (1.0, 5.0)]
+    search = search_hyperparameters(candidate, axes, start=(0.05, 0.05, 5.0), together=2)
+    assert search.best[0] == 0.7
+    assert search.best[1] >= 5.0
+    found = dict(zip(map(tuple, search.points.tolist()), search.weighed.log_evidence, strict=True))
+    assert tuple(search.points[0]) == (0.05, 0.05, 5.0)
+    assert found[search.best] == max(found.values())
+    for axis, values in enumerate(axes):
+        for value in values:
+            neighbour = (*search.best[:axis], value, *search.best[axis + 1 :])
+            if abs(values.index(value) - values.index(search.best[axis])) == 1:
+                assert select_hyperparameters([candidate(neighbour)]).log_evidence[0] <= found[search.best] + 1e-6
+    np.testing.assert_allclose(search.weighed.weights.sum(), 1)
+
+
+def test_the_climb_stays_where_the_answers_say_nothing():
+    search = search_hyperparameters(lambda _: Candidate(np.zeros((3, 2))), [(1.0, 2.0)], start=(2.0,))
+    assert search.best == (2.0,)
+    with pytest.raises(ValueError, match=r"start: expected a value of each of 1 axes, got \(3.0,\)"):
+        search_hyperparameters(lambda _: Candidate(np.zeros((3, 2))), [(1.0, 2.0)], start=(3.0,))
 
 
 @pytest.mark.parametrize(

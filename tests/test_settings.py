@@ -33,6 +33,9 @@ BAD = {
     "evaluation_episodes": [0, NAN],
     "centres": [0, -300, 1.5],
     "max_steps": [0, -1, True, 10.0],
+    "recent_iterations": [0, -4, True, 2.0],
+    "hyperparameters": ["chosen", None],
+    "utility_bandwidth_factor": [0, -1.0, NAN],
 }
 
 
