@@ -19,7 +19,12 @@ console = Console(soft_wrap=True)
 
 Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot, or any gymnasium id.")]
 Utility = Annotated[
-    str | None, typer.Option(help="posterior-mean, most-likely, linear-program or known-reward (the ceiling).")
+    str | None,
+    typer.Option(help="posterior-mean, most-likely, posterior-draw, linear-program or known-reward (the ceiling)."),
+]
+Query = Annotated[
+    str | None,
+    typer.Option(help="highest-utility (the paper's), probably-better, thompson, information or disagreement."),
 ]
 Iterations = Annotated[int | None, typer.Option(help="Cycles of the four steps.")]
 KLBound = Annotated[float | None, typer.Option("--kl-bound", help="Bound on each policy update, in nats.")]
@@ -41,6 +46,7 @@ Expert = Annotated[str | None, typer.Option(help="return (simulated) or terminal
 def run(
     env: Env,
     utility: Utility = None,
+    query: Query = None,
     iterations: Iterations = None,
     kl_bound: KLBound = None,
     likelihood: Likelihood = None,
@@ -90,6 +96,7 @@ def report(
 def trials(
     env: Env,
     utility: Utility = None,
+    query: Query = None,
     iterations: Iterations = None,
     kl_bound: KLBound = None,
     likelihood: Likelihood = None,

@@ -19,6 +19,8 @@ from bayespbrl.trajectories import Trajectory, transitions
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
 COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE = range(7)
+# Posterior draws that a rule for questions looks at: enough to order ten candidates, in hundredths of a second.
+QUERY_DRAWS = 500
 
 
 class Learner:
@@ -183,7 +185,7 @@ class Learner:
             candidates = queries.random_candidates(numbers, rng=self._rng(CHOOSE, state.iteration))
         else:
             wanted = settings.queries_per_iteration
-            candidates = queries.highest_utility_candidates(numbers, state.estimate.trajectory_utilities(collected))
+            candidates = self._candidates(numbers, collected)
         event = {
             "event": "collected",
             "iteration": state.iteration + 1,
@@ -192,6 +194,23 @@ class Learner:
             "seconds": time.perf_counter() - began,
         }
         self._record(event, trajectories=collected)
+
+    def _candidates(self, numbers: Sequence[int], collected: Sequence[Trajectory]) -> tuple[int, ...]:
+        """The new trajectories in the order in which to ask about them."""
+        state, rule = self.state, self.settings.query
+        if rule == "highest-utility":
+            return queries.highest_utility_candidates(numbers, state.estimate.trajectory_utilities(collected))
+        shown = [*collected, state.trajectories[state.preferences.undominated[-1]]]
+        draws = state.estimate.trajectory_draws(shown, number=QUERY_DRAWS)
+        return queries.posterior_candidates(
+            rule,
+            numbers,
+            draws[:, :-1],
+            draws[:, -1],
+            likelihood=state.estimate.likelihood,
+            scale=state.estimate.scale,
+            rng=self._rng(CHOOSE, state.iteration),
+        )
 
     def _show(self) -> None:
         """Step 4: the next question, the best candidate against the newest of the undominated."""

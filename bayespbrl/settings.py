@@ -4,7 +4,9 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-UTILITIES = ("posterior-mean", "most-likely", "linear-program", "known-reward")
+UTILITIES = ("posterior-mean", "most-likely", "posterior-draw", "linear-program", "known-reward")
+WITHOUT_POSTERIOR = ("linear-program", "known-reward")
+QUERIES = ("highest-utility", "probably-better", "thompson", "information", "disagreement")
 LIKELIHOODS = ("mixed", "logistic", "probit")
 EXPERTS = ("return", "terminal", "other")
 POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
@@ -29,6 +31,8 @@ class Settings:
         by the `evidence` of the answers, beginning at the given ones, or are the `given` ones.
       utility_bandwidth_factor: multiplies the median rule for the utility's features.
       seed: of every random choice of the run.
+      query: which of the new trajectories are asked about; `highest-utility` is the paper's rule, the others look at
+        the posterior.
       trajectories_per_iteration: N.
       queries_per_iteration, first_queries: M, in later iterations and in the first.
       discount: γ.
@@ -58,6 +62,7 @@ class Settings:
     hyperparameters: str = "evidence"
     utility_bandwidth_factor: float = 1.0
     seed: int = 0
+    query: str = "highest-utility"
     trajectories_per_iteration: int = 10
     queries_per_iteration: int = 1
     first_queries: int = 2
@@ -78,6 +83,9 @@ class Settings:
     def __post_init__(self) -> None:
         _one_of("utility", self.utility, UTILITIES)
         _one_of("likelihood", self.likelihood, LIKELIHOODS)
+        _one_of("query", self.query, QUERIES)
+        if self.query != QUERIES[0] and self.utility in WITHOUT_POSTERIOR:
+            raise ValueError(f"query: expected {QUERIES[0]} with {self.utility}, no posterior, got {self.query!r}")
         _one_of("policy", self.policy, POLICIES)
         _one_of("features", self.features, FEATURES)
         _one_of("hyperparameters", self.hyperparameters, HYPERPARAMETERS)

@@ -9,6 +9,8 @@ from xarray import DataTree
 
 from bayespbrl.features import RadialBasis
 from bayespbrl.models import Candidate, linear_program, sample_posterior, search_hyperparameters
+from bayespbrl.models.likelihoods import Likelihood, preference_likelihood
+from bayespbrl.models.low_rank import low_rank
 from bayespbrl.preferences import pair_differences
 from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
 
@@ -18,7 +20,7 @@ StateFeatures = Callable[[np.ndarray], np.ndarray]
 BANDWIDTH_MULTIPLES = (0.25, 0.5, 1.0, 2.0, 4.0)
 STEEPNESS_MULTIPLES = (0.2, 1.0, 5.0)
 LAPSE_RATES = (0.0, 0.1, 0.4)
-WEIGHTS = {"posterior-mean": "utility_weights_mean", "most-likely": "utility_weights_most_likely"}
+METHODS = ("posterior-mean", "most-likely", "posterior-draw")
 
 
 @dataclass(frozen=True)
@@ -87,21 +89,43 @@ class LinearUtility:
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> np.ndarray:
         return trajectory_features(trajectories, self.features, discount=self.discount) @ self.weights
 
-    def draws(self, features: np.ndarray) -> np.ndarray:
+    def draws(self, features: np.ndarray, *, number: int | None = None) -> np.ndarray:
         """Posterior draws of wᵀφ for each row of `features`, (n, D): of states, or of feature sums ψ(τ).
+
+        Args:
+          features: shape (n, D).
+          number: at most so many draws in all, evenly spaced, but at least one a chain; None for all.
 
         Returns:
           shape (chain, draw, n), in the units of `weights`.
 
         Raises:
-          ValueError: an estimate without a posterior, or features of another length.
+          ValueError: an estimate without a posterior, features of another length, or a number < 1.
         """
         if self.posterior is None:
             raise ValueError("draws: expected an estimate with a posterior, got one without")
         if features.ndim != 2 or features.shape[1] != len(self.weights):
             raise ValueError(f"features: expected shape (n, {len(self.weights)}), got {features.shape}")
-        weights = self.posterior["posterior"]["utility_weights"].values
-        return weights @ features.T / self.scale
+        if number is not None and number < 1:
+            raise ValueError(f"number: expected at least 1 draw, got {number}")
+        weights = self.posterior.children["posterior"].to_dataset()["utility_weights"]
+        apart = 1 if number is None else -(-weights.shape[0] * weights.shape[1] // number)
+        return weights[:, ::apart].values @ features.T / self.scale
+
+    def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
+        """Posterior draws of wᵀψ(τ) of each trajectory, all chains' in one, shape (S, n); arguments of `draws`."""
+        features = trajectory_features(trajectories, self.features, discount=self.discount)
+        return self.draws(features, number=number).reshape(-1, len(trajectories))
+
+    @property
+    def likelihood(self) -> Likelihood:
+        """Of the next answer, as a function of a difference of utilities times `scale`; needs a posterior."""
+        if self.posterior is None:
+            raise ValueError("likelihood: expected an estimate with a posterior, got one without")
+        options = {name: self.posterior.attrs[name] for name in ("steepness", "lapse_rate")}
+        return preference_likelihood(
+            self.posterior.attrs["likelihood"], number_of_preferences=self.quality.pairs, **options
+        )
 
 
 @dataclass(frozen=True)
@@ -237,7 +261,7 @@ def estimate_utility(
       trajectories: n of them.
       pairs: K ordered pairs (preferred, dominated) of their numbers.
       features: φ, (N, S) states to (N, D).
-      method: `posterior-mean`, `most-likely`, `linear-program` or `known-reward`.
+      method: `posterior-mean`, `most-likely`, `posterior-draw`, `linear-program` or `known-reward`.
       discount: γ of ψ.
       prior_scale, steepness, lapse_rate, likelihood: of the posterior.
       seed: of the sampler.
@@ -281,7 +305,8 @@ def infer_utility(
       feature_sums: ψ of n trajectories, or the features of n items of any kind, shape (n, D).
       pairs: K ordered pairs (preferred, dominated) of their row numbers.
       features: φ, where utilities of single states are wanted too; the rows themselves otherwise.
-      method: `posterior-mean`, `most-likely` or `linear-program`.
+      method: `posterior-mean`; `most-likely`; `posterior-draw`, one draw picked by `seed`, with what the answers do not
+        touch at its mean, zero, where a draw of the prior would only be noise; or `linear-program`.
       discount, prior_scale, steepness, lapse_rate, likelihood, seed: as of `estimate_utility`.
 
     Raises:
@@ -290,8 +315,8 @@ def infer_utility(
     feature_sums = np.asarray(feature_sums, dtype=np.float64)
     if feature_sums.ndim != 2 or not np.all(np.isfinite(feature_sums)):
         raise ValueError(f"feature_sums: expected a finite matrix (n, D), got shape {feature_sums.shape} or NaN")
-    if method not in WEIGHTS and method != "linear-program":
-        raise ValueError(f"method: expected {', '.join(WEIGHTS)} or linear-program, got {method!r}")
+    if method not in METHODS and method != "linear-program":
+        raise ValueError(f"method: expected {', '.join(METHODS)} or linear-program, got {method!r}")
     features = _as_they_are if features is None else features
     differences = pair_differences(pairs, feature_sums)
     scaled, scale = _scaled(differences)
@@ -308,7 +333,7 @@ def infer_utility(
         likelihood=likelihood,
         seed=seed,
     )
-    weights = np.asarray(tree[WEIGHTS[method]]) / scale
+    weights = _weights(tree, method, seed) / scale
     quality = FitQuality(
         converged=bool(tree.attrs["converged"]),
         status="converged" if tree.attrs["converged"] else "the sampler did not converge within its cap of draws",
@@ -319,6 +344,15 @@ def infer_utility(
         log_evidence=float(tree.attrs["log_evidence"]),
     )
     return LinearUtility(features, weights, discount, quality, tree, scale)
+
+
+def _weights(tree: DataTree, method: str, seed: int) -> np.ndarray:
+    """The weights, shape (D,), that stand for a posterior."""
+    if method != "posterior-draw":
+        return np.asarray(tree["utility_weights_" + method.removeprefix("posterior-").replace("-", "_")])
+    z = np.asarray(tree["posterior"]["coordinates"])
+    chain, draw = np.random.default_rng([seed, 1]).integers(z.shape[:2])
+    return low_rank(np.asarray(tree["constant_data"]["differences"])).basis @ z[chain, draw]
 
 
 def _as_they_are(features: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from bayespbrl import Answer, Learner, ReturnExpert, rollouts
+from bayespbrl import Answer, Learner, ReturnExpert, queries, rollouts
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 
@@ -87,6 +87,51 @@ def test_the_first_iteration_compares_three_of_the_new_trajectories_and_later_on
     assert len(first_three) == 3
     assert max(first_three) < 10
     assert [query.newcomer // 10 for query in shown] == [0, 0, 1, 2]
+
+
+DRAWS = {"utility": "posterior-mean", "hyperparameters": "given", "iterations": 2}
+POSTERIOR_RULES = ("probably-better", "thompson", "information", "disagreement")
+
+
+@pytest.mark.parametrize("query", POSTERIOR_RULES)
+def test_a_query_rule_orders_all_new_trajectories_by_the_posterior(query):
+    run, log = remembered(**DRAWS, query=query)
+    run.run(ReturnExpert())
+    first, *later = [entry.event for entry in log.entries if entry.event["event"] == "collected"]
+    plain, plain_log = remembered()
+    plain.ask()
+    assert first == plain_log.entries[0].event | {"seconds": first["seconds"]}  # nothing to look at yet
+    for number, event in enumerate(later, start=1):
+        assert sorted(event["candidates"]) == list(range(10 * number, 10 * number + 10))
+
+
+def test_the_rules_ask_about_the_trajectory_whose_score_is_highest():
+    for query, score in (
+        ("probably-better", queries.probability_better),
+        ("information", None),
+    ):
+        run = learner(**DRAWS, query=query)
+        while questions := run.ask():
+            if run.state.iteration:
+                new, (question,) = run.trajectories[-10:], questions
+                draws = run.estimate.trajectory_draws([*new, run.trajectories[question.incumbent]], number=500)
+                if score is None:
+                    options = {"likelihood": run.estimate.likelihood, "scale": run.estimate.scale}
+                    scores = queries.expected_information(draws[:, :-1], draws[:, -1], **options)
+                else:
+                    scores = score(draws[:, :-1], draws[:, -1])
+                assert scores[question.newcomer % 10] == scores.max()
+            run.tell([ReturnExpert()(*questions[0].trajectories)])
+
+
+@pytest.mark.parametrize("options", [{"query": "thompson"}, {"query": "information", "utility": "posterior-draw"}])
+def test_a_learner_that_looks_at_draws_continues_as_if_never_stopped(options):
+    options = DRAWS | options
+    straight, log = remembered(**options)
+    straight.run(ReturnExpert())
+    for length in (5, 6, 7):  # before the first fit, after it, and after the candidates that follow from it
+        continued = learner(log.entries[:length], **options)
+        assert fingerprint(continued.run(ReturnExpert())) == fingerprint(straight)
 
 
 def test_more_questions_an_iteration_are_asked_one_after_the_other():

@@ -14,6 +14,7 @@ BAD = {
     "likelihood": ["eq8", None],
     "policy": ["neural", None],
     "features": ["mine"],
+    "query": ["entropy", "", None, 1],
     "expert": ["oracle"],
     "iterations": [0, -3, 2.0, True, "25", None, NAN],
     "kl_bound": [0, 0.0, -0.1, NAN, INFINITY, True, "0.3", None],
@@ -44,6 +45,16 @@ def test_a_bad_value_is_refused_with_name_expected_and_got(name, value):
     with pytest.raises(ValueError, match=rf"^{name}: expected .*, got ") as refusal:
         Settings("gridworld", **{name: value})
     assert repr(value)[:20] in str(refusal.value)
+
+
+@pytest.mark.parametrize("utility", ["linear-program", "known-reward"])
+@pytest.mark.parametrize("query", ["probably-better", "thompson", "information", "disagreement"])
+def test_a_query_rule_that_needs_a_posterior_is_refused_without_one(utility, query):
+    message = f"^query: expected highest-utility with {utility}, no posterior, got '{query}'$"
+    with pytest.raises(ValueError, match=message):
+        Settings("gridworld", utility=utility, query=query)
+    assert Settings("gridworld", utility=utility).query == "highest-utility"
+    assert Settings("gridworld", utility="posterior-draw", query=query).query == query
 
 
 def test_every_option_is_checked():

@@ -1,16 +1,19 @@
 """Step 1 on small cases: three discrete states, one-hot features, so that ψ can be written down."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.optimize
 
+from bayespbrl import utility
 from bayespbrl.features import OneHot, RadialBasis
+from bayespbrl.models.likelihoods import Logistic, Mixed, WithLapses
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
 from bayespbrl.utility import KnownReward, choose_hyperparameters, estimate_utility
 
-METHODS = ("posterior-mean", "most-likely", "linear-program")
+METHODS = ("posterior-mean", "most-likely", "posterior-draw", "linear-program")
 
 
 def staying(state, steps=4, reward=0.0):
@@ -107,6 +110,63 @@ def test_the_same_seed_gives_the_same_draws_and_another_gives_others():
     )
     np.testing.assert_array_equal(one.weights, same.weights)
     assert not np.array_equal(one.weights, other.weights)
+
+
+def test_a_posterior_draw_is_a_draw_without_what_the_answers_do_not_touch():
+    estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-draw", discount=0.9, seed=4)
+    assert estimate.weights[0] == 0  # never compared
+    assert estimate.weights[1] == -estimate.weights[2]  # only their difference was
+    draws = estimate.draws(np.array([[0.0, -1.0, 1.0]]))
+    assert np.isclose(draws, estimate.weights[2] - estimate.weights[1], rtol=1e-12).sum() == 1
+
+
+def test_posterior_draws_of_many_seeds_are_spread_as_the_posterior_is():
+    estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-mean", discount=0.9)
+    drawn = [utility._weights(estimate.posterior, "posterior-draw", seed) for seed in range(400)]
+    margins = np.array(drawn) @ [0, -1, 1] / estimate.scale
+    draws = estimate.draws(np.array([[0.0, -1.0, 1.0]]))
+    assert np.std(margins) == pytest.approx(draws.std(), rel=0.15)
+    assert abs(np.mean(margins) - draws.mean()) < 4 * draws.std() / np.sqrt(400)
+
+
+def test_fewer_draws_are_some_of_all_evenly_spaced():
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="posterior-mean", discount=0.9)
+    every = estimate.draws(np.eye(3))
+    chains, length = every.shape[:2]
+    np.testing.assert_array_equal(estimate.draws(np.eye(3), number=chains * length), every)
+    np.testing.assert_allclose(estimate.draws(np.eye(3), number=100), every[:, :: length * chains // 100], rtol=1e-12)
+    np.testing.assert_allclose(estimate.draws(np.eye(3), number=1), every[:, :1], rtol=1e-12)
+    with pytest.raises(ValueError, match="number: expected at least 1 draw, got 0"):
+        estimate.draws(np.eye(3), number=0)
+
+
+def test_draws_of_a_trajectory_are_those_of_its_feature_sum():
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="posterior-mean", discount=0.9)
+    sums = trajectory_features(TRAJECTORIES, ONE_HOT, discount=0.9)
+    draws = estimate.trajectory_draws(TRAJECTORIES, number=40)
+    np.testing.assert_allclose(draws, estimate.draws(sums, number=40).reshape(40, 4), rtol=1e-12)
+    # trajectory 3 stays where trajectory 2 does, half as long
+    np.testing.assert_allclose(draws[:, 3] / draws[:, 2], (1 + 0.9) / np.sum(0.9 ** np.arange(4)), rtol=1e-12)
+
+
+def test_the_likelihood_of_the_next_answer_is_that_of_the_fit():
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="posterior-mean", discount=0.9)
+    assert estimate.likelihood == Mixed(5.0, 2.0)
+    for options, expected in (
+        ({"steepness": 3.0, "likelihood": "logistic"}, Logistic(3.0)),
+        ({"lapse_rate": 0.25}, WithLapses(Mixed(5.0, 2.0), 0.25)),
+    ):
+        fit = estimate.posterior.copy()
+        fit.attrs |= options
+        assert replace(estimate, posterior=fit).likelihood == expected
+
+
+def test_without_a_posterior_there_are_no_draws_and_no_likelihood():
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="linear-program", discount=0.9)
+    with pytest.raises(ValueError, match="draws: expected an estimate with a posterior"):
+        estimate.draws(np.eye(3))
+    with pytest.raises(ValueError, match="likelihood: expected an estimate with a posterior"):
+        _ = estimate.likelihood
 
 
 def test_the_linear_program_reaches_the_optimum_that_scipy_finds():
