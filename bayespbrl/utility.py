@@ -192,10 +192,7 @@ def choose_hyperparameters(
 
     Source: specification, section 8: the utility's length scale is chosen by evidence.
     """
-    compared = sorted({number for pair in pairs for number in pair})
-    row = {number: position for position, number in enumerate(compared)}
-    rows = [(row[preferred], row[dominated]) for preferred, dominated in pairs]
-    shown = [trajectories[number] for number in compared]
+    shown, rows = _compared(trajectories, pairs)
     dimensions = len(features.bandwidths) if isinstance(features, RadialBasis) else 0
     differences: dict[tuple[float, ...], np.ndarray] = {}
 
@@ -231,6 +228,15 @@ def choose_hyperparameters(
         float(search.weighed.weights[reached]),
         len(search.points),
     )
+
+
+def _compared(
+    trajectories: Sequence[Trajectory], pairs: Sequence[tuple[int, int]]
+) -> tuple[list[Trajectory], list[tuple[int, int]]]:
+    """The trajectories that some pair names, or one where none does, and the pairs by their numbers among these."""
+    numbers = sorted({number for pair in pairs for number in pair} or {0})
+    row = {number: position for position, number in enumerate(numbers)}
+    return [trajectories[number] for number in numbers], [(row[i], row[j]) for i, j in pairs]
 
 
 def _scaled(differences: np.ndarray) -> tuple[np.ndarray, float]:
@@ -272,8 +278,9 @@ def estimate_utility(
         returns = np.array([trajectory.total_reward for trajectory in trajectories])
         satisfied = sum(bool(returns[i] > returns[j]) for i, j in pairs)
         return KnownReward(FitQuality(True, "known reward", len(pairs), satisfied))
+    shown, pairs = _compared(trajectories, pairs)
     return infer_utility(
-        trajectory_features(trajectories, features, discount=discount),
+        trajectory_features(shown, features, discount=discount),
         pairs,
         features=features,
         method=method,
