@@ -232,7 +232,9 @@ def test_every_figure_takes_axes_and_returns_them_and_every_table_is_a_data_set(
     iterations = report_tables.iterations_table(evidence.iterations)
     states, answers = report_tables.utility_table(evidence), report_tables.answers_table(evidence)
     scores, compared = report_tables.prequential_table(evidence), report_tables.trajectories_table(evidence)
-    assert all(isinstance(table, xr.Dataset) for table in (iterations, states, answers, scores, compared))
+    ranking = report_tables.ranking_table(evidence)
+    assert all(isinstance(table, xr.Dataset) for table in (iterations, states, answers, scores, compared, ranking))
+    assert set(range(20, 30)) < set(ranking["trajectory"].values)  # the newest, and the undominated one
     line = states.assign_attrs(kind="line")
     calls = [(report_figures.plot_column, iterations, "kl"), (report_figures.plot_answers, answers)]
     calls += [(report_figures.plot_states, states, states["mean"].values), (report_figures.plot_state_bands, line)]

@@ -67,12 +67,12 @@ def assembled(evidence: Evidence) -> dict[str, Any]:
     """Everything that the templates name: facts, sentences, warnings and sections."""
     iterations = report_tables.iterations_table(evidence.iterations)
     answers = report_tables.answers_table(evidence)
-    scores = report_tables.prequential_table(evidence)
+    scores, ranking = report_tables.prequential_table(evidence), report_tables.ranking_table(evidence)
     failures: list[report_warnings.Caution] = []
     parts: list[tuple[str, Callable[[], Section]]] = [
         ("Learning curve", lambda: report_sections.learning(evidence, iterations)),
         ("Have the fits converged?", lambda: report_sections.fits(evidence, iterations)),
-        ("What it thinks is good", lambda: report_utility.utility(evidence)),
+        ("What it thinks is good", lambda: report_utility.utility(evidence, ranking)),
         ("The answers", lambda: report_answers.answers(evidence, answers)),
         ("Are its probabilities right?", lambda: report_sections.calibration(evidence, scores)),
         ("The policy updates", lambda: report_sections.updates(evidence, iterations)),
@@ -84,7 +84,7 @@ def assembled(evidence: Evidence) -> dict[str, Any]:
         "title": f"{evidence.settings.env}, {evidence.settings.utility}, seed {evidence.settings.seed}",
         "state": _state(evidence),
         "facts": _facts(evidence),
-        "learnt": report_findings.learnt(evidence, iterations, answers, scores),
+        "learnt": report_findings.learnt(evidence, iterations, answers, scores, ranking),
         "warnings": report_warnings.warnings(evidence, iterations, answers, scores) + failures,
         "sections": sections,
         "made": f"Made by bayespbrl {version('bayespbrl')} on {datetime.now():%Y-%m-%d %H:%M} from {evidence.path}.",

@@ -1,9 +1,8 @@
 """What can be read of a run directory, finished, in progress or broken: the evidence that the report is made of.
 
-The same fold over the log as the learner's own, but a file that cannot be read costs what is in it and nothing more.
+A file that cannot be read costs what is in it and nothing more.
 """
 
-import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -13,40 +12,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl import events
 from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
+from bayespbrl.diagnostics.report_log import AnswerRecord, read_log
 from bayespbrl.envs.opening import open_environment
-from bayespbrl.events import Entry, LearnerState
 from bayespbrl.features import checked_features
-from bayespbrl.preferences import Answer, Preferences
-from bayespbrl.runs import RunDirectory, read_parts, read_summary
+from bayespbrl.preferences import Preferences
+from bayespbrl.runs import RunDirectory, read_parts
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory, trajectory_features
 
 WITHOUT_POSTERIOR = ("linear-program", "known-reward")
-
-
-@dataclass(frozen=True)
-class AnswerRecord:
-    """One question that was answered.
-
-    Attributes:
-      question: its number, from 1.
-      iteration: in which it was asked, from 1.
-      first, second: numbers of the two trajectories in the order shown.
-      answer: what the expert said.
-      row: which of the K ordered pairs it is; None where it gave none (a tie, a skip).
-      predicted: probability that the first is preferred, by the estimate that the learner had when it asked; NaN where
-        that was no posterior or cannot be read.
-    """
-
-    question: int
-    iteration: int
-    first: int
-    second: int
-    answer: Answer
-    row: int | None
-    predicted: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -105,27 +80,25 @@ def read_evidence(directory: Path | str, *, env: Any = None, features: Any = Non
     Raises:
       ValueError: a directory that is no run, or one of a newer version.
     """
-    log = RunDirectory.open(directory)
-    broken: list[str] = []
-    kept = _surviving(log.path, broken)
-    state, records, done = _folded(kept, log.settings, broken)
-    summaries = _summaries(log.path, state, broken)
-    environment = _environment(log.settings.env if env is None else env, broken)
-    reader = _Reader(log, features, broken)
-    for number in range(1, max(done, len(summaries)) + 1):
-        records = reader.read(number, records, improved=number <= len(summaries))
+    run = RunDirectory.open(directory)
+    log = read_log(run.path, run.settings)
+    broken, records = list(log.broken), list(log.answers)
+    environment = _environment(run.settings.env if env is None else env, broken)
+    reader = _Reader(run, features, broken)
+    for number in range(1, max(log.collected, len(log.summaries)) + 1):
+        records = reader.read(number, records, improved=number <= len(log.summaries))
     return Evidence(
-        path=log.path,
-        settings=log.settings,
-        iterations=summaries,
+        path=run.path,
+        settings=run.settings,
+        iterations=log.summaries,
         answers=tuple(records),
-        preferences=state.preferences,
+        preferences=log.state.preferences,
         trajectories=reader.trajectories,
         estimate=reader.estimate,
         estimate_iteration=reader.estimate_iteration,
         features_missing=reader.features_missing,
         environment=environment,
-        waiting=None if state.query is None else state.query.number,
+        waiting=None if log.state.query is None else log.state.query.number,
         broken=tuple(broken),
     )
 
@@ -137,9 +110,9 @@ def _not_passed(states: np.ndarray) -> np.ndarray:
 class _Reader:
     """Reads one iteration's file after the other, and predicts its answers by the estimate from before them."""
 
-    def __init__(self, log: RunDirectory, features: Callable[[np.ndarray], np.ndarray] | None, broken: list[str]):
-        self.log, self.broken, self.features, self.features_missing = log, broken, features, ""
-        if features is None and log.settings.features == "other":
+    def __init__(self, run: RunDirectory, features: Callable[[np.ndarray], np.ndarray] | None, broken: list[str]):
+        self.run, self.broken, self.features, self.features_missing = run, broken, features, ""
+        if features is None and run.settings.features == "other":
             self.features, self.features_missing = _not_passed, "it was not passed again"
         self.trajectories: dict[int, Trajectory] = {}
         self.estimate: Any = None
@@ -147,7 +120,7 @@ class _Reader:
 
     def read(self, number: int, records: list[AnswerRecord], *, improved: bool) -> list[AnswerRecord]:
         """`records` with the predictions of the answers of iteration `number`."""
-        file = self.log.iteration_file(number)
+        file = self.run.iteration_file(number)
         parts: dict[str, Any] = {}
         try:
             parts = read_parts(
@@ -159,7 +132,7 @@ class _Reader:
                 parts = read_parts(file, ("trajectories",))
         if not parts:
             return records
-        first = (number - 1) * self.log.settings.trajectories_per_iteration
+        first = (number - 1) * self.run.settings.trajectories_per_iteration
         self.trajectories |= dict(enumerate(parts["trajectories"], start=first))
         if self.estimate_iteration == number - 1:
             records = [self._predicted(record) if record.iteration == number else record for record in records]
@@ -182,7 +155,7 @@ class _Reader:
     def _predicted(self, record: AnswerRecord) -> AnswerRecord:
         numbers = (record.first, record.second)
         both = [self.trajectories[number] for number in numbers if number in self.trajectories]
-        if self.log.settings.utility in WITHOUT_POSTERIOR or len(both) < 2:
+        if self.run.settings.utility in WITHOUT_POSTERIOR or len(both) < 2:
             return record
         if self.estimate is None:
             probability = 0.5  # before any answer, the prior says nothing of which is better
@@ -193,76 +166,6 @@ class _Reader:
             difference = (sums[[0]] - sums[[1]]) / self.estimate.scale
             probability = float(answer_probabilities(self.estimate.posterior, difference)[0, PREFERRED])
         return AnswerRecord(**{**vars(record), "predicted": probability})
-
-
-def _surviving(path: Path, broken: list[str]) -> list[Mapping[str, Any]]:
-    """The events up to the first line that is none, what was undone left out."""
-    file = path / "events.jsonl"
-    if not file.exists():
-        return []
-    try:
-        *lines, rest = file.read_text(encoding="utf-8", errors="replace").split("\n")
-    except OSError as error:
-        broken.append(f"events.jsonl cannot be read ({error}).")
-        return []
-    if rest:
-        broken.append("events.jsonl: the last line is cut off, as a process killed while writing leaves it.")
-    log: list[Mapping[str, Any]] = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            event = json.loads(line)
-        except ValueError:
-            event = None
-        if not isinstance(event, dict) or "event" not in event:
-            broken.append(f"events.jsonl, line {number}: no event; this line and what follows is left out.")
-            break
-        log.append(event)
-    try:
-        return events.surviving(log)
-    except ValueError as error:
-        broken.append(f"events.jsonl: {error}.")
-        return [event for event in log if event["event"] != "undone"]
-
-
-def _folded(
-    log: list[Mapping[str, Any]], settings: Settings, broken: list[str]
-) -> tuple[LearnerState, list[AnswerRecord], int]:
-    """The learner's state without its heavy parts, the answers, and how many iterations have trajectories."""
-    state, records, collected = LearnerState(None), [], 0
-    # what the fold asks of the heavy parts is that they are there
-    parts = {"trajectories": [None] * settings.trajectories_per_iteration, "policy": None, "estimate": None}
-    for event in log:
-        query, pairs, iteration = state.query, len(state.preferences.pairs), state.iteration + 1
-        try:
-            state = events.replay(state, [Entry(event, parts)])
-        except ValueError as error:
-            broken.append(f"events.jsonl: {error}; what follows is left out.")
-            break
-        if event["event"] == "collected":
-            collected += 1
-        elif event["event"] == "answered" and query is not None:
-            after = len(state.preferences.pairs)
-            row = after - 1 if after > pairs else None  # the pair that was asked about is the last of its answer's
-            answer = Answer(event["answer"])
-            records.append(AnswerRecord(query.number, iteration, query.first, query.second, answer, row))
-    return state, records, collected
-
-
-def _summaries(path: Path, state: LearnerState, broken: list[str]) -> tuple[Mapping[str, Any], ...]:
-    """Summaries by the log, or by `summary.json` where the log has fewer."""
-    logged = tuple(summary for summary in state.summaries if isinstance(summary, Mapping))
-    if not (path / "summary.json").exists():
-        return logged
-    try:
-        kept = read_summary(path)["iterations"]
-    except ValueError as error:
-        broken.append(f"{error}.")
-        return logged
-    kept = tuple(summary for summary in kept if isinstance(summary, Mapping)) if isinstance(kept, list) else ()
-    if len(kept) > len(logged):
-        broken.append(f"events.jsonl holds {len(logged)} completed iterations, summary.json {len(kept)}.")
-        return kept
-    return logged
 
 
 def _environment(env: Any, broken: list[str]) -> Any:

@@ -6,10 +6,11 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl.diagnostics.report_evidence import WITHOUT_POSTERIOR, Evidence
-from bayespbrl.diagnostics.report_tables import return_draws
 
 
-def learnt(evidence: Evidence, iterations: xr.Dataset, answers: xr.Dataset, scores: xr.Dataset) -> list[str]:
+def learnt(
+    evidence: Evidence, iterations: xr.Dataset, answers: xr.Dataset, scores: xr.Dataset, ranking: xr.Dataset
+) -> list[str]:
     """Plain sentences with figures, for the head of the report."""
     number = iterations.sizes["iteration"]
     if number == 0:
@@ -20,8 +21,7 @@ def learnt(evidence: Evidence, iterations: xr.Dataset, answers: xr.Dataset, scor
     if quality is not None and quality.pairs:
         satisfied = f"{quality.pairs_satisfied} of {count(quality.pairs, 'preference')}"
         sentences.append(f"It agrees with {satisfied} that follow from the answers.")
-    if evidence.posterior is not None and not evidence.features_missing:
-        sentences += _sureness(evidence)
+    sentences += _sureness(evidence, ranking)
     before = answers["before"].values[answers["iteration"].values > 1]  # the first ones meet the prior: a coin's chance
     before = before[np.isfinite(before)]
     if before.size:
@@ -48,10 +48,12 @@ def _reached(evidence: Evidence, iterations: xr.Dataset) -> str:
     if optimum is not None:
         text += f", {percent(value[-1] / optimum, 1)} of the optimum {figure(optimum)}"
     best = int(np.argmax(value))
-    when = f"{figure(value[best])} after {count(int(answers[best]), 'answer')}"
-    return f"{text}. After the first iteration it was {figure(value[0])}; " + (
-        "it has never been better." if best == len(value) - 1 else f"the best was {when}."
-    )
+    when = f"after {count(int(answers[best]), 'answer')}"
+    text += f". After the first iteration it was {figure(value[0])}; "
+    if best == len(value) - 1:
+        return f"{text}it has never been better."
+    same = figure(value[best]) == figure(value[-1])
+    return text + (f"it was as good {when} already." if same else f"the best was {figure(value[best])} {when}.")
 
 
 def figure(number: float) -> str:
@@ -110,31 +112,28 @@ def _trust(evidence: Evidence) -> str:
     )
 
 
-def _sureness(evidence: Evidence) -> list[str]:
+def _sureness(evidence: Evidence, ranking: xr.Dataset) -> list[str]:
     """How sure the posterior is of the order of the newest trajectories, and that the undominated one is the best."""
-    size = evidence.settings.trajectories_per_iteration
-    newest = [n for n in sorted(evidence.trajectories) if n >= (evidence.estimate_iteration - 1) * size]
-    best = [n for n in evidence.preferences.undominated[-1:] if n in evidence.trajectories]
-    numbers = sorted({*newest[:size], *best})
-    if len(numbers) < 2:
+    number = ranking.sizes["trajectory"]
+    if number < 2:
         return []
-    draws = return_draws(evidence, numbers)
-    above = np.mean(draws[:, :, None] > draws[:, None, :], axis=0)
-    pairs = np.triu_indices(len(numbers), k=1)
-    sure = float(np.mean(np.maximum(above[pairs], above[pairs[1], pairs[0]])))
+    better = ranking["better_probability"].values[np.triu_indices(number, k=1)]
+    sure = float(np.mean(np.maximum(better, 1 - better)))
     sentences = [
-        f"Taking two of the newest {len(numbers)} trajectories at a time, it is {percent(sure)} sure, on average, "
+        f"Taking two of the newest {number} trajectories at a time, it is {percent(sure)} sure, on average, "
         "which of them is better (50 % is knowing nothing)."
     ]
-    for number in best:
-        wins = percent(np.mean(draws.argmax(axis=1) == numbers.index(number)))
-        sentences.append(f"With probability {wins} trajectory {number}, undominated so far, is the best of these.")
+    for best in set(evidence.preferences.undominated[-1:]) & set(ranking["trajectory"].values.tolist()):
+        wins = percent(float(ranking["best_probability"].sel(trajectory=best)))
+        sentences.append(f"With probability {wins} trajectory {best}, undominated so far, is the best of these.")
     return sentences
 
 
 def _calibrated(scores: xr.Dataset) -> str:
     score, expected, sd = (float(scores[name]) for name in ("log_score", "log_score_expected", "log_score_sd"))
     text = f"The log score is {figure(score)} nats, where {figure(expected)} ± {figure(sd)} was to be expected: "
+    if scores.sizes["prediction"] < 10:
+        return text + "too few to judge by."
     if score < expected - 2 * sd:
         return text + "it was surer than it should have been."
     return text + ("it could have been surer." if score > expected + 2 * sd else "no sign of false confidence.")

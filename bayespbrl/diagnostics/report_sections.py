@@ -13,7 +13,7 @@ from bayespbrl.diagnostics.prequential import plot_calibration
 from bayespbrl.diagnostics.report_document import Section, Table, drawn
 from bayespbrl.diagnostics.report_evidence import WITHOUT_POSTERIOR, Evidence
 from bayespbrl.diagnostics.report_findings import cell, figure, no_posterior
-from bayespbrl.diagnostics.report_tables import thinned
+from bayespbrl.diagnostics.uncertainty import thinned
 
 RANKED = 4
 
@@ -145,7 +145,7 @@ def leaning(evidence: Evidence) -> Section:
     if evidence.posterior is None:
         return Section("sensitivity", title, [no_posterior(evidence)])
     try:
-        result = sensitivity(thinned(evidence.posterior, 4000))
+        result = sensitivity(thinned(evidence.estimate, 4000).posterior)
     except ValueError as error:  # ArviZ cannot smooth a tail of equal weights
         few = "That happens while the answers are few and most draws explain them equally well."
         return Section("sensitivity", title, [f"It cannot be estimated ({error}) {few}"])

@@ -9,8 +9,8 @@ from gymnasium.spaces import Discrete
 
 from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report_evidence import Evidence
+from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws, thinned
 from bayespbrl.preferences import Answer
-from bayespbrl.trajectories import trajectory_features
 
 MEASURED = (
     "answers",
@@ -128,7 +128,7 @@ def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
     if states.ndim == 1:
         data["visits"] = ("state", np.bincount(states, minlength=len(shown)))
     if evidence.posterior is not None:
-        draws = _weights(evidence) @ features.T / estimate.scale
+        draws = thinned(estimate, DRAWS).draws(features).reshape(-1, len(shown))
         chosen = np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)
         mean = np.asarray(evidence.posterior["utility_weights_mean"]) / estimate.scale
         data["mean"], data["sd"] = ("state", features @ mean), ("state", draws.std(axis=0))
@@ -153,38 +153,25 @@ def trajectories_table(evidence: Evidence) -> xr.Dataset:
     data: dict[str, Any] = {"hidden_return": ("trajectory", np.array([t.total_reward for t in shown]))}
     data["utility"] = ("trajectory", evidence.estimate.trajectory_utilities(shown) if shown else np.zeros(0))
     if evidence.posterior is not None and shown:
-        draws = return_draws(evidence, numbers)
+        draws = return_draws(evidence.estimate, shown, number=DRAWS)["returns"]
         for name, level in (("lower", 0.05), ("upper", 0.95)):
-            data[name] = ("trajectory", np.quantile(draws, level, axis=0))
+            data[name] = ("trajectory", draws.quantile(level, dim=("chain", "draw")).values)
     return xr.Dataset(data, coords={"trajectory": numbers})
 
 
-def return_draws(evidence: Evidence, numbers: Sequence[int]) -> np.ndarray:
-    """Posterior draws of the utility of whole trajectories, shape (draw, trajectory)."""
-    shown, estimate = [evidence.trajectories[number] for number in numbers], evidence.estimate
-    sums = trajectory_features(shown, estimate.features, discount=estimate.discount)
-    return _weights(evidence) @ sums.T / estimate.scale
+def ranking_table(evidence: Evidence) -> xr.Dataset:
+    """What the posterior says about the order of the newest iteration's trajectories and the undominated one.
 
-
-def thinned(tree: xr.DataTree, number: int) -> xr.DataTree:
-    """The tree with every n-th draw, so that about `number` of all chains are left."""
-    groups = {path: node.to_dataset(inherit=False) for path, node in tree.subtree_with_keys}
-    size = groups["posterior"].sizes
-    step = max(1, size["chain"] * size["draw"] // number)
-    return xr.DataTree.from_dict(
-        {
-            path: data.isel(draw=slice(None, None, step)) if "draw" in data.dims else data
-            for path, data in groups.items()
-        }
-    )
-
-
-def _weights(evidence: Evidence) -> np.ndarray:
-    """Draws of the utility weights, shape (draw, feature)."""
-    if evidence.posterior is None:
-        raise ValueError("draws: expected an estimate with a posterior, got one without")
-    weights = np.asarray(thinned(evidence.posterior, DRAWS)["posterior"]["utility_weights"])
-    return weights.reshape(-1, weights.shape[-1])
+    As of `ranking_probabilities`, with their numbers along `trajectory`; none of them without features or posterior.
+    """
+    size = evidence.settings.trajectories_per_iteration
+    newest = [n for n in sorted(evidence.trajectories) if n >= (evidence.estimate_iteration - 1) * size][:size]
+    best = [n for n in evidence.preferences.undominated[-1:] if n in evidence.trajectories]
+    numbers = sorted({*newest, *best}) if evidence.posterior is not None and not evidence.features_missing else []
+    if not numbers:
+        return xr.Dataset(coords={"trajectory": np.zeros(0, dtype=np.int64)})
+    draws = return_draws(evidence.estimate, [evidence.trajectories[n] for n in numbers], number=DRAWS)
+    return ranking_probabilities(draws.assign_coords(trajectory=numbers))
 
 
 def _states_to_show(

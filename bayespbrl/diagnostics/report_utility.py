@@ -11,9 +11,10 @@ from bayespbrl.diagnostics.report_document import Picture, Section, drawn
 from bayespbrl.diagnostics.report_evidence import Evidence
 from bayespbrl.diagnostics.report_findings import no_posterior, percent
 from bayespbrl.diagnostics.report_tables import trajectories_table, utility_table
+from bayespbrl.diagnostics.uncertainty import plot_ranking
 
 
-def utility(evidence: Evidence) -> Section:
+def utility(evidence: Evidence, ranking: xr.Dataset) -> Section:
     """The utility with its uncertainty over the states, and of the trajectories that were compared."""
     title = "What it thinks is good"
     if evidence.estimate is None:
@@ -42,6 +43,14 @@ def utility(evidence: Evidence) -> Section:
         panels = [("Trajectories", partial(figures.plot_trajectories, compared))]
         alt = f"Inferred utility against hidden return of {compared.sizes['trajectory']} trajectories."
         blocks.append(drawn("trajectories", panels, caption, alt, columns=1, size=(6.0, 3.3)))
+    if ranking.sizes["trajectory"] > 1:
+        caption = (
+            "The newest trajectories and the undominated one: the probability of each rank, rank 1 the best. A sharp "
+            "diagonal is an order that is known; columns of one shade are one that is not."
+        )
+        panels = [("Ranking", partial(plot_ranking, ranking))]
+        alt = f"Probabilities of the ranks of {ranking.sizes['trajectory']} trajectories."
+        blocks.append(drawn("ranking", panels, caption, alt, columns=1, size=(6.0, 3.6)))
     return Section("utility", title, text, blocks)
 
 
