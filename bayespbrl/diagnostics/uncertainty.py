@@ -7,7 +7,6 @@ Results are in units of the utility, which answers fix up to a positive factor o
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -40,8 +39,8 @@ def return_draws(estimate: Any, trajectories: Sequence[Trajectory], *, number: i
     Raises:
       ValueError: an estimate without a posterior; no trajectories; a number < 1.
     """
-    estimate = thinned(estimate, number)
-    draws = estimate.draws(trajectory_features(trajectories, estimate.features, discount=estimate.discount))
+    features = _with_posterior(estimate).features
+    draws = estimate.draws(trajectory_features(trajectories, features, discount=estimate.discount), number=number)
     return xr.Dataset(
         {"returns": (("chain", "draw", "trajectory"), draws)},
         {"trajectory": np.arange(len(trajectories))},
@@ -148,11 +147,11 @@ def q_draws(
     Raises:
       ValueError: an estimate without a posterior; no states or no actions.
     """
-    estimate, states, actions = thinned(estimate, number), np.asarray(states), np.asarray(actions)
+    estimate, states, actions = _with_posterior(estimate), np.asarray(states), np.asarray(actions)
     if states.ndim == 0 or actions.ndim == 0 or not (len(states) and len(actions)):
         raise ValueError(f"states, actions: expected at least one row each, got {states.shape} and {actions.shape}")
     rows = successors(np.repeat(states, len(actions), axis=0), np.concatenate([actions] * len(states)))
-    draws = estimate.draws(rows)
+    draws = estimate.draws(rows, number=number)
     labels = actions.reshape(len(actions), -1)
     return xr.Dataset(
         {"q": (("chain", "draw", "state", "action"), draws.reshape(*draws.shape[:2], len(states), len(actions)))},
@@ -261,19 +260,6 @@ def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="action", ylabel="state", title=_titled("Best action", greedy))
     return axes
-
-
-def thinned(estimate: Any, number: int) -> Any:
-    """The estimate with at most `number` draws, evenly spaced over the chains, and at least one a chain.
-
-    Raises:
-      ValueError: an estimate without a posterior; a number < 1.
-    """
-    if number < 1:
-        raise ValueError(f"number: expected at least 1 draw, got {number}")
-    sizes = _with_posterior(estimate).posterior.children["posterior"].sizes
-    apart = -(-sizes["chain"] * sizes["draw"] // number)
-    return replace(estimate, posterior=estimate.posterior.isel(draw=slice(None, None, apart)))
 
 
 def _with_posterior(estimate: Any) -> Any:
