@@ -305,6 +305,7 @@ def test_what_a_schedule_and_the_choice_of_hyperparameters_said_is_shown(copy):
     table = report_tables.iterations_table(read_evidence(copy).iterations)
     np.testing.assert_allclose(table["schedule statistic"], [0.5, 0.6, 0.7])
     np.testing.assert_allclose(table["hyperparameters bandwidth_factor"], [1, 2, 4])
+    np.testing.assert_allclose(table["hyperparameters weights 1"], 0.75)
     np.testing.assert_allclose(table["action_standard_deviation"], 0.2)
     path = write_report(copy)
     assert "<b>sure</b> enough" in read(path).text  # as text,

@@ -119,14 +119,18 @@ def _facts(evidence: Evidence) -> list[tuple[str, str]]:
     expert = settings.expert + (f", {settings.wrong_answers:.0%} wrong" if settings.wrong_answers else "")
     return [
         ("likelihood", settings.likelihood),
-        ("prior scale σ", f"{settings.prior_scale:g}"),
-        ("steepness m", f"{settings.steepness:g}"),
-        ("lapse rate λ", f"{settings.lapse_rate:g}"),
+        ("prior scale σ", f"{evidence.fitted_with('prior_scale'):g}"),
+        ("steepness m", f"{evidence.fitted_with('steepness'):g}"),
+        ("lapse rate λ", f"{evidence.fitted_with('lapse_rate'):g}"),
         ("KL bound ε", f"{settings.kl_bound:g}"),
         ("discount γ", f"{settings.discount:g}"),
         ("policy", settings.policy),
         ("expert", expert),
-        *((name, str(getattr(settings, name))) for name in ("schedule", "query") if hasattr(settings, name)),
+        *(
+            (name, str(getattr(settings, name)))
+            for name in ("schedule", "query", "hyperparameters")
+            if hasattr(settings, name)
+        ),
     ]
 
 

@@ -64,6 +64,11 @@ class Evidence:
         """Draws of the estimate; None where it is no posterior."""
         return getattr(self.estimate, "posterior", None)
 
+    def fitted_with(self, name: str) -> float:
+        """`prior_scale`, `steepness` or `lapse_rate` of the last fit, by evidence perhaps; else by settings."""
+        posterior = self.posterior
+        return float(getattr(self.settings, name) if posterior is None else posterior.attrs[name])
+
     @property
     def dynamics(self) -> Any:
         """The environment's pure functions, where it has some."""

@@ -156,8 +156,8 @@ def leaning(evidence: Evidence) -> Section:
     above = {part: int((result["sensitivity"].sel(component=part) >= limit).sum()) for part in ("prior", "likelihood")}
     text = [
         f"Of {number} margins, {above['prior']} change noticeably (above {limit:g}) when the prior scale σ = "
-        f"{evidence.settings.prior_scale:g} changes a little, {above['likelihood']} when the answers count a little "
-        f"more or less, as they do with another steepness m = {evidence.settings.steepness:g}.",
+        f"{evidence.fitted_with('prior_scale'):g} changes a little, {above['likelihood']} when the answers count "
+        f"a little more or less, as they do with another steepness m = {evidence.fitted_with('steepness'):g}.",
         "A margin that leans on the prior is one whose size the answers leave open: they say which is better, seldom "
         "by how much. Its sign, which is what the order of trajectories needs, can be sure all the same.",
     ]

@@ -38,8 +38,8 @@ DRAWS, CLOUD, RESOLUTION, SHOWN_DRAWS = 1000, 3000, 60, 3
 def iterations_table(summaries: Sequence[Mapping[str, Any]]) -> xr.Dataset:
     """What each completed iteration reported, as float64 along `iteration`; NaN where it said nothing.
 
-    A list of numbers is averaged. What a schedule or the choice of hyper-parameters said becomes variables `schedule …`
-    and `hyperparameters …`, texts where they are no numbers.
+    A list of numbers is averaged there. What a schedule or the choice of hyper-parameters said becomes variables
+    `schedule …` and `hyperparameters …`, texts where they are no numbers.
     """
     columns: dict[str, Any] = {name: [_number(summary.get(name)) for summary in summaries] for name in MEASURED}
     for group in ("schedule", "hyperparameters"):
@@ -219,11 +219,11 @@ def _number(value: Any) -> float:
 
 
 def _flat(value: Any) -> dict[str, Any]:
-    """A mapping with those within it joined on: {"a": {"b": 1}} as {"a b": 1}."""
+    """A mapping with mappings and lists within it joined on: {"a": {"b": 1}, "c": [2]} as {"a b": 1, "c 0": 2}."""
     if not isinstance(value, Mapping):
         return {}
     flat: dict[str, Any] = {}
     for key, entry in value.items():
-        inner = _flat(entry)
+        inner = _flat(dict(enumerate(entry)) if isinstance(entry, list) else entry)
         flat |= {f"{key} {name}": part for name, part in inner.items()} if inner else {str(key): entry}
     return flat

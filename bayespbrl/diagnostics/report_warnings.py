@@ -139,7 +139,7 @@ def _of_answers(evidence: Evidence, answers: xr.Dataset, scores: xr.Dataset) -> 
             Caution(
                 f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
                 "See the pictures below. Mistaken answers: allow for them with --lapse-rate 0.1 (now "
-                f"{evidence.settings.lapse_rate:g}). Right ones: the features cannot tell what matters; use more "
+                f"{evidence.fitted_with('lapse_rate'):g}). Right ones: the features cannot tell what matters; use more "
                 "centres or features of your own.",
             )
         )
