@@ -5,6 +5,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.optimize import brentq
 
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
 ITERATIONS = 500  # cap of the solver; some twenty are usual
@@ -105,6 +106,76 @@ def reps_weights(
         effective_samples=float(1 / np.sum(probabilities**2)),
         converged=converged,
         status=status,
+    )
+
+
+def reps_weights_by_state(
+    q_values: np.ndarray, states: np.ndarray, base_weights: np.ndarray, *, kl_bound: float
+) -> RepsSolution:
+    """Maximise Σ pᵢQᵢ subject to KL(p‖W) ≤ ε and p(s) = W(s) for every single state: `reps_weights` with one-hot φ.
+
+    For all actions of each visited state, where that leaves the actions free. Then p(a|s) ∝ q(a|s) exp(Q(s, a)/η) and
+    V(s) = η log Σₐ q(a|s) exp(Q(s, a)/η), and one number is left to find, the temperature.
+
+    Args:
+      q_values: Qᵢ, shape (N,).
+      states: number of the state of each sample, shape (N,) int; 0 … n − 1, and each of them occurs.
+      base_weights: Wᵢ = q(a|s) × visits > 0 with sum 1, shape (N,).
+      kl_bound: ε > 0, nats.
+
+    Raises:
+      ValueError: as `reps_weights`.
+
+    Source: paper, eqs. 11-13, in the limit of features that tell all states apart.
+    """
+    _check(q_values, states, base_weights, kl_bound)
+    visits = np.bincount(states, weights=base_weights)
+    if np.any(visits == 0):
+        raise ValueError(f"states: expected each of 0 … {len(visits) - 1}, got none of {np.argmin(visits)}")
+    logarithms = np.log(base_weights / visits[states])  # log q(a|s)
+    means = np.bincount(states, weights=base_weights * q_values) / visits
+    spread = np.sqrt(base_weights @ (q_values - means[states]) ** 2)
+    constant = not spread > 1e-8 * np.max(np.abs(q_values))
+    scaled = np.zeros_like(q_values) if constant else (q_values - means[states]) / spread
+
+    def solution(temperature: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """p(a|s), V(s) less the mean of Q there, in standard deviations of Q, and KL."""
+        logits = logarithms + scaled / temperature
+        highest = np.full(len(visits), -np.inf)
+        np.maximum.at(highest, states, logits)
+        normaliser = highest + np.log(np.bincount(states, weights=np.exp(logits - highest[states])))
+        logits = logits - normaliser[states]
+        chances = np.exp(logits)
+        return chances, temperature * normaliser, float((visits[states] * chances) @ (logits - logarithms))
+
+    low, high = TEMPERATURE_FLOOR, 1.0
+    if constant or solution(low)[2] <= kl_bound:
+        temperature = 1.0 if constant else low
+    else:
+        while solution(high)[2] > kl_bound:  # at most a few dozen times: KL falls as 1/η²
+            high *= 10
+
+        def excess(logarithm: float) -> float:
+            return solution(float(np.exp(logarithm)))[2] - kl_bound
+
+        temperature = float(np.exp(brentq(excess, np.log(low), np.log(high), xtol=1e-12)))
+    chances, values, kl = solution(temperature)
+    probabilities = visits[states] * chances
+    gap = float(np.max(np.abs(np.bincount(states, weights=probabilities) - visits)))
+    return RepsSolution(
+        sample_weights=probabilities / base_weights,
+        probabilities=probabilities,
+        value_weights=means if constant else means + spread * values,
+        temperature=1.0 if constant else float(spread * temperature),
+        kl=kl,
+        kl_bound=kl_bound,
+        bound_active=bool(abs(kl - kl_bound) <= 0.01 * kl_bound),
+        feature_gap=gap,
+        feature_gap_raw=gap,
+        rank_kept=int(np.sum(visits > 0)) - 1,
+        effective_samples=float(1 / np.sum(probabilities**2)),
+        converged=True,
+        status="constant Q: nothing to gain" if constant else "in closed form",
     )
 
 

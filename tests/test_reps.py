@@ -3,7 +3,7 @@ import pytest
 import scipy.optimize
 
 from bayespbrl import reps
-from bayespbrl.reps import reps_weights
+from bayespbrl.reps import reps_weights, reps_weights_by_state
 
 
 def random_problem(states=6, actions=3, seed=0):
@@ -128,3 +128,68 @@ def test_a_solver_that_fails_leaves_the_policy_as_it_is_and_says_so(monkeypatch)
     assert "Maximum_Iterations" in solution.status
     np.testing.assert_allclose(solution.sample_weights, 1.0)
     assert solution.kl == pytest.approx(0.0, abs=1e-12)
+
+
+def by_state(problem):
+    q_values, features, base = problem
+    return q_values, features.argmax(axis=1), base
+
+
+@pytest.mark.parametrize("kl_bound", [0.001, 0.1, 0.5])
+def test_state_by_state_is_the_dual_with_one_hot_features(kl_bound):
+    problem = random_problem()
+    general = reps_weights(*problem, kl_bound=kl_bound)
+    exact = reps_weights_by_state(*by_state(problem), kl_bound=kl_bound)
+    assert exact.kl == pytest.approx(kl_bound, rel=1e-9)
+    assert exact.bound_active
+    assert exact.converged
+    np.testing.assert_allclose(exact.probabilities, general.probabilities, atol=1e-6)
+    np.testing.assert_allclose(exact.sample_weights, general.sample_weights, atol=1e-4)
+    assert exact.temperature == pytest.approx(general.temperature, rel=1e-4)
+    # V is known up to a constant; the general one has the mean of V(s) taken out
+    visits = np.bincount(problem[1].argmax(axis=1), weights=problem[2])
+    values = [solution.value_weights - visits @ solution.value_weights for solution in (exact, general)]
+    np.testing.assert_allclose(*values, atol=1e-3)
+    assert (exact.rank_kept, general.rank_kept) == (5, 5)
+    assert exact.effective_samples == pytest.approx(general.effective_samples, rel=1e-4)
+
+
+def test_state_by_state_no_state_gains_or_loses_weight_whatever_its_q():
+    q_values, states, base = by_state(random_problem(states=40, actions=2, seed=3))
+    solution = reps_weights_by_state(q_values + 1e3 * states, states, base, kl_bound=0.05)
+    alike = reps_weights_by_state(q_values, states, base, kl_bound=0.05)
+    np.testing.assert_allclose(solution.sample_weights, alike.sample_weights, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.bincount(states, weights=solution.probabilities), np.bincount(states, weights=base), rtol=1e-12
+    )
+    assert solution.feature_gap < 1e-13
+    assert solution.kl == pytest.approx(0.05, rel=1e-6)
+    assert solution.sample_weights @ base == pytest.approx(1)
+
+
+def test_state_by_state_a_bound_that_no_policy_reaches_is_not_active():
+    q_values, states, base = by_state(random_problem())
+    solution = reps_weights_by_state(q_values, states, base, kl_bound=50.0)
+    assert not solution.bound_active
+    best = np.array([q_values[states == state].argmax() for state in range(6)])
+    chances = solution.probabilities.reshape(6, 3) / np.bincount(states, weights=base)[:, None]
+    np.testing.assert_allclose(chances, np.eye(3)[best], atol=1e-6)
+
+
+def test_state_by_state_a_q_that_is_the_same_for_all_actions_changes_nothing():
+    _, states, base = by_state(random_problem())
+    solution = reps_weights_by_state(7.0 + states, states, base, kl_bound=0.3)
+    np.testing.assert_allclose(solution.sample_weights, 1.0, rtol=1e-12)
+    assert not solution.bound_active
+    assert solution.kl == pytest.approx(0, abs=1e-15)
+
+
+def test_state_by_state_bad_input_is_refused():
+    q_values, states, base = by_state(random_problem())
+    for arguments in ((q_values[1:], states, base), (q_values * np.nan, states, base), (q_values, states, 2 * base)):
+        with pytest.raises(ValueError, match="expected"):
+            reps_weights_by_state(*arguments, kl_bound=0.3)
+    with pytest.raises(ValueError, match=r"states: expected each of 0 … 6, got none of 2"):
+        reps_weights_by_state(q_values, states + (states >= 2), base, kl_bound=0.3)
+    with pytest.raises(ValueError, match="kl_bound"):
+        reps_weights_by_state(q_values, states, base, kl_bound=0.0)
