@@ -80,14 +80,20 @@ class LinearUtility:
 
     def utilities(self, states: np.ndarray) -> np.ndarray:
         """wᵀφ(s) of N states, shape (N,)."""
-        return self.features(states) @ self.weights
+        return self._same_width(self.features(states)) @ self.weights
 
     def step_utilities(self, steps: Transitions) -> np.ndarray:
         """uᵢ = wᵀφ(sᵢ′): the utility of the *next* state, the same convention as in ψ."""
         return self.utilities(steps.next_states)
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> np.ndarray:
-        return trajectory_features(trajectories, self.features, discount=self.discount) @ self.weights
+        features = trajectory_features(trajectories, self.features, discount=self.discount)
+        return self._same_width(features) @ self.weights
+
+    def _same_width(self, features: np.ndarray) -> np.ndarray:
+        if features.shape[1] != len(self.weights):
+            raise ValueError(f"features: expected {len(self.weights)}, as many as ever, got {features.shape[1]}")
+        return features
 
     def draws(self, features: np.ndarray, *, number: int | None = None) -> np.ndarray:
         """Posterior draws of wᵀφ for each row of `features`, (n, D): of states, or of feature sums ψ(τ).

@@ -21,7 +21,7 @@ from typing import Any
 
 import jax
 
-from bayespbrl import Learner, ReturnExpert, features, lstd, models, policies, reps, rollouts, trajectories
+from bayespbrl import Learner, ReturnExpert, features, lstd, models, policies, reps, rollouts, trajectories, utility
 from bayespbrl.policies import batch, hyperparameter_search
 
 FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
@@ -31,10 +31,10 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
         trajectories.trajectory_features,
     ),
     "sampler": (models.sample_posterior,),
-    "evidence": (models.select_hyperparameters,),
+    "evidence": (utility.choose_hyperparameters,),
     "linear program": (models.linear_program,),
     "LSTD": (lstd.lstd_q,),
-    "dual": (reps.reps_weights,),
+    "dual": (reps.reps_weights, reps.reps_weights_by_state),
     "CMA-ES": (hyperparameter_search.search,),
     "actions": (batch.sample_actions, batch.entropies),
     "rollouts": (rollouts.rollout,),

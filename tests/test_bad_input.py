@@ -75,6 +75,15 @@ def straight():
     return fingerprint(bayespbrl.Learner(Slope(), **own_parts(), **QUICK).run(ReturnExpert()))
 
 
+@pytest.fixture(scope="module")
+def calls_an_iteration():
+    """How often the features are called in the first iteration."""
+    counted = Faulty(features, None, 10**6)
+    parts = own_parts() | {"features": counted}
+    bayespbrl.Learner(Slope(), **parts, **(QUICK | {"iterations": 1})).run(ReturnExpert())
+    return 10**6 - counted.calls
+
+
 def stopped(directory, message, *, env=None, expert=None, **parts):
     """A run on disk that stops with an error; nothing in it is half-written."""
     learner = runs.start(env or Slope(), directory, **(own_parts() | parts), **QUICK)
@@ -121,17 +130,14 @@ def test_an_environment_that_fails_in_the_middle_of_a_trajectory(tmp_path, strai
         (lambda states: None, r"features Faulty: expected shape \(\d+, D\), got \(\)"),
     ],
 )
-def test_features_of_the_wrong_shape_or_kind(tmp_path, straight, wrong, message):
-    calls = 0
+def test_features_of_the_wrong_shape_or_kind(tmp_path, straight, calls_an_iteration, wrong, message):
+    stopped(tmp_path / "run", message, features=Faulty(features, wrong, calls_an_iteration + 1))
+    goes_on(tmp_path / "run", 1, straight)
 
-    def counted(states):
-        nonlocal calls
-        calls += 1
-        return features(states)
 
-    one = bayespbrl.Learner(Slope(), **(own_parts() | {"features": counted}), **(QUICK | {"iterations": 1}))
-    one.run(ReturnExpert())
-    stopped(tmp_path / "run", message, features=Faulty(features, wrong, calls + 1))
+def test_features_that_are_suddenly_more(tmp_path, straight, calls_an_iteration):
+    more = Faulty(features, lambda states: np.hstack([states, features(states)]), calls_an_iteration)
+    stopped(tmp_path / "run", "features: expected 4, as many as ever, got 6", features=more)
     goes_on(tmp_path / "run", 1, straight)
 
 
