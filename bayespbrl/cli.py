@@ -26,6 +26,12 @@ Query = Annotated[
     str | None,
     typer.Option(help="highest-utility (the paper's), probably-better, thompson, information or disagreement."),
 ]
+Schedule = Annotated[
+    str | None, typer.Option(help="constant (the paper's), or confidence: the bound follows the posterior's certainty.")
+]
+Hyperparameters = Annotated[
+    str | None, typer.Option(help="evidence: length scales, steepness and lapse rate by the answers; or given.")
+]
 Iterations = Annotated[int | None, typer.Option(help="Cycles of the four steps.")]
 KLBound = Annotated[float | None, typer.Option("--kl-bound", help="Bound on each policy update, in nats.")]
 Likelihood = Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or probit.")]
@@ -47,6 +53,8 @@ def run(
     env: Env,
     utility: Utility = None,
     query: Query = None,
+    schedule: Schedule = None,
+    hyperparameters: Hyperparameters = None,
     iterations: Iterations = None,
     kl_bound: KLBound = None,
     likelihood: Likelihood = None,
@@ -97,6 +105,8 @@ def trials(
     env: Env,
     utility: Utility = None,
     query: Query = None,
+    schedule: Schedule = None,
+    hyperparameters: Hyperparameters = None,
     iterations: Iterations = None,
     kl_bound: KLBound = None,
     likelihood: Likelihood = None,

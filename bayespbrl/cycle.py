@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from bayespbrl import events, improvement, queries, rollouts, utility
+from bayespbrl import events, improvement, queries, rollouts, schedules, utility
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
@@ -21,6 +21,8 @@ from bayespbrl.trajectories import Trajectory, transitions
 COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE = range(7)
 # Posterior draws that a rule for questions looks at: enough to order ten candidates, in hundredths of a second.
 QUERY_DRAWS = 500
+# And a schedule: a share of them is known within 0.04, which is less than it moves between bounds.
+SCHEDULE_DRAWS = 200
 
 
 class Learner:
@@ -33,6 +35,7 @@ class Learner:
       env: a short name (`gridworld`, …), a gymnasium id, or an environment.
       features: φ of your own, from observations (N, S) to (N, D); drawn by the settings when None.
       policy: a kind of policy by name, as of `Settings`, or a first policy of your own.
+      schedule: of the KL bound by name, as of `Settings`, or one of your own (`bayespbrl.schedules`).
       entries: events of a run to continue.
       **settings: options of `Settings`, over the preset of the environment.
 
@@ -46,6 +49,7 @@ class Learner:
         *,
         features: utility.StateFeatures | None = None,
         policy: Any = None,
+        schedule: schedules.Schedule | str | None = None,
         entries: Iterable[Entry] = (),
         **settings: Any,
     ):
@@ -55,9 +59,11 @@ class Learner:
             env if isinstance(env, str) else environment_name(self.environment),
             policy=policy if own_policy is None else "other",
             features="drawn" if features is None else "other",
+            schedule="other" if callable(schedule) else schedule,
             **settings,
         )
         self.features = features
+        self.schedule = schedule if callable(schedule) else _schedule(self.settings.schedule)
         self.log: Log | None = None
         if own_policy is None:
             own_policy = initial_policy(
@@ -229,7 +235,7 @@ class Learner:
         estimate, choice = self._estimate()
         clock.append(time.perf_counter())
         steps = transitions(state.trajectories)
-        update = self._update(estimate, steps)
+        update, bound = self._update(estimate, steps)
         clock.append(time.perf_counter())
         evaluated = rollouts.returns(
             self.environment,
@@ -241,6 +247,7 @@ class Learner:
         clock.append(time.perf_counter())
         seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
         summary = _summary(state, estimate, update, evaluated, seconds)
+        summary["schedule"] = {"reason": bound.reason, **bound.statistics}
         summary["hyperparameters"] = None if choice is None else choice.summary()
         size = settings.trajectories_per_iteration
         self._record(
@@ -275,7 +282,8 @@ class Learner:
         )
         return estimate, choice
 
-    def _update(self, estimate: Any, steps: Any) -> improvement.Improvement:
+    def _update(self, estimate: Any, steps: Any) -> tuple[improvement.Improvement, schedules.Bound]:
+        """Step 2, by as much as the schedule allows once it has seen what an update would do."""
         settings, iteration = self.settings, self.state.iteration
         rng = self._rng(FEATURES, 2 * iteration + 1)
         state_action_features = draw_state_action_features(
@@ -288,7 +296,16 @@ class Learner:
             bandwidth_factor=settings.bandwidth_factor,
             period=self._period,
         )
-        return improvement.improve(
+        bounds: list[schedules.Bound] = []
+
+        def decide(update: improvement.ProposedUpdate) -> float:
+            situation = schedules.Situation(
+                iteration + 1, self.state.preferences.answers, settings.kl_bound, estimate, update
+            )
+            bounds.append(schedules.decided(self.schedule, situation))
+            return bounds[-1].kl_bound
+
+        improved = improvement.improve(
             self.state.policy,
             steps,
             estimate.step_utilities(steps),
@@ -297,12 +314,20 @@ class Learner:
             action_space=self.environment.action_space,
             state_features=self._state_features(rng, bandwidth_factor=settings.bandwidth_factor),
             state_action_features=state_action_features,
-            kl_bound=settings.kl_bound,
+            kl_bound=decide,
             discount=settings.discount,
             fixed_point_ridge=settings.fixed_point_ridge,
             projection_ridge=settings.projection_ridge,
             visited=self._recent_states(),
+            utility_draws=self._utility_draws(estimate, steps),
         )
+        return improved, bounds[-1]
+
+    def _utility_draws(self, estimate: Any, steps: Any) -> np.ndarray | None:
+        """Utilities of each step under some posterior draws, (N, S); None where no schedule asks or none are there."""
+        if isinstance(self.schedule, schedules.ConstantBound) or getattr(estimate, "posterior", None) is None:
+            return None
+        return estimate.draws(estimate.features(steps.next_states), number=SCHEDULE_DRAWS).reshape(-1, len(steps)).T
 
     def _recent_states(self) -> np.ndarray:
         """The states in which the last iterations acted: those of the policy update."""
@@ -344,6 +369,12 @@ class Learner:
 
     def _key(self, purpose: int, count: int) -> jax.Array:
         return jax.random.key(int(self._rng(purpose, count).integers(2**31)))
+
+
+def _schedule(name: str) -> schedules.Schedule:
+    if name not in schedules.SCHEDULES:
+        raise ValueError(f"schedule: expected a function of the user's own beside {name!r}, got none")
+    return schedules.SCHEDULES[name]
 
 
 def _summary(

@@ -1,7 +1,7 @@
 """Step 2: from a utility to a better policy: LSTD-Q, actor-critic REPS, policy fit (paper, "Step 2")."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -54,6 +54,42 @@ class Improvement:
     action_standard_deviation: tuple[float, ...] | None
 
 
+@dataclass(frozen=True, eq=False)
+class ProposedUpdate:
+    """What an update of any size would do, before one is decided on.
+
+    Attributes:
+      q_values: Qᵢ of the samples of the update, shape (N,).
+      state_features: φ(sᵢ) of the constraint on the state distribution, shape (N, D).
+      base_weights: Wᵢ, shape (N,).
+      q_draws: Qᵢ under each of S posterior draws of the utility, shape (N, S); None without a posterior.
+    """
+
+    q_values: np.ndarray
+    state_features: np.ndarray
+    base_weights: np.ndarray
+    q_draws: np.ndarray | None = None
+    solved: dict[float, RepsSolution] = field(default_factory=dict, repr=False)
+
+    def solve(self, kl_bound: float) -> RepsSolution:
+        """REPS for the mean Q at this bound (eqs. 11-13); each bound is solved once."""
+        if kl_bound not in self.solved:
+            self.solved[kl_bound] = reps_weights(
+                self.q_values, self.state_features, self.base_weights, kl_bound=kl_bound
+            )
+        return self.solved[kl_bound]
+
+    def gains(self, kl_bound: float) -> np.ndarray:
+        """Σ (pᵢ − Wᵢ)Qᵢ under each draw: what it expects of the update at this bound, in its utility's units; (S,)."""
+        if self.q_draws is None:
+            raise ValueError("gains: expected a utility estimate with a posterior, got one without")
+        return (self.solve(kl_bound).probabilities - self.base_weights) @ self.q_draws
+
+    def agreement(self, kl_bound: float) -> float:
+        """Share of the draws that expect a gain."""
+        return float(np.mean(self.gains(kl_bound) > 0))
+
+
 def improve(
     policy: Any,
     steps: Transitions,
@@ -64,11 +100,12 @@ def improve(
     action_space: Space,
     state_features: Callable[[np.ndarray], np.ndarray],
     state_action_features: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    kl_bound: float,
+    kl_bound: float | Callable[[ProposedUpdate], float],
     discount: float,
     fixed_point_ridge: float,
     projection_ridge: float,
     visited: np.ndarray | None = None,
+    utility_draws: np.ndarray | None = None,
 ) -> Improvement:
     """One policy update of actor-critic REPS from all observed transitions.
 
@@ -79,10 +116,12 @@ def improve(
       key, rng: for the fresh actions and for the policy fit.
       state_features: φ(s) of the constraint on the state distribution (eq. 11).
       state_action_features: φ(s, a) of Q.
-      kl_bound: ε, nats.
+      kl_bound: ε, nats; or what decides on it, once it has seen what updates would do.
       discount, fixed_point_ridge, projection_ridge: of LSTD.
       visited: states of the policy update, shape (n, S) or (n,); those of all transitions when None. LSTD always has
         all transitions.
+      utility_draws: the utilities under each of S posterior draws, shape (N, S): LSTD is linear in them, so that they
+        cost no more solutions. None: only the utilities count.
 
     Raises:
       ValueError: utilities that do not fit the transitions or are not finite.
@@ -92,10 +131,10 @@ def improve(
     if utilities.shape != (len(steps),) or not np.all(np.isfinite(utilities)):
         raise ValueError(f"utilities: expected {len(steps)} finite numbers, got shape {utilities.shape} or NaN")
     next_key, fresh_key = jax.random.split(key)
-    q_function = estimate_q(
+    q_functions = estimate_q(
         policy,
         steps,
-        utilities,
+        utilities if utility_draws is None else np.column_stack([utilities, utility_draws]),
         key=next_key,
         action_space=action_space,
         features=state_action_features,
@@ -111,12 +150,18 @@ def improve(
         actions = sample_actions(policy, fresh_key, states)
     # Q is of the action that the environment would see; the fit is of the action that the policy drew, because
     # fitting clipped ones would shrink the policy at every update
-    q_values = q_function(states[rows], clipped(actions, action_space))
-    reps = reps_weights(q_values, state_features(states)[rows], base_weights, kl_bound=kl_bound)
+    q_values = q_functions(states[rows], clipped(actions, action_space)).reshape(len(rows), -1)
+    update = ProposedUpdate(
+        q_values[:, 0],
+        state_features(states)[rows],
+        base_weights,
+        None if utility_draws is None else q_values[:, 1:],
+    )
+    reps = update.solve(kl_bound(update) if callable(kl_bound) else kl_bound)
     fitted = policy.fit(states[rows], actions, reps.sample_weights, rng=rng, base_weights=base_weights)
     return Improvement(
         policy=fitted,
-        q_function=q_function,
+        q_function=replace(q_functions, weights=q_functions.weights.reshape(len(q_functions.weights), -1)[:, 0]),
         reps=reps,
         kl_fitted_policy=float(visits @ fitted.kl_divergence(policy, states)),
         entropy=float(visits @ entropies(fitted, states)),

@@ -27,6 +27,7 @@ from bayespbrl.events import Entry, LearnerState, surviving
 from bayespbrl.models import restored, stored
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
+from bayespbrl.schedules import ConstantBound
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import LinearUtility
@@ -38,52 +39,72 @@ PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "policy", 
 
 
 def start(
-    env: Any, directory: Path | str | None = None, *, features: Any = None, policy: Any = None, **settings: Any
+    env: Any,
+    directory: Path | str | None = None,
+    *,
+    features: Any = None,
+    policy: Any = None,
+    schedule: Any = None,
+    **settings: Any,
 ) -> Learner:
     """A new learner that keeps everything it does in a run directory.
 
     Args:
       env: as of `Learner`.
       directory: must not exist; a fresh one under `runs/` when None.
-      features, policy, **settings: as of `Learner`.
+      features, policy, schedule, **settings: as of `Learner`.
 
     Raises:
       ValueError: bad options, or a directory that exists; nothing is left behind then.
     """
-    learner = Learner(env, features=features, policy=policy, **settings)
+    learner = Learner(env, features=features, policy=policy, schedule=schedule, **settings)
     log = RunDirectory.create(
         fresh_directory(learner.settings.env) if directory is None else directory, learner.settings
     )
     return learner.logged(log)
 
 
-def resume(directory: Path | str, *, env: Any = None, features: Any = None, policy: Any = None) -> Learner:
+def resume(
+    directory: Path | str, *, env: Any = None, features: Any = None, policy: Any = None, schedule: Any = None
+) -> Learner:
     """The learner of a run directory as it was after its last complete event; it goes on writing there.
 
     Args:
       directory: a run directory, of a run that was stopped, killed or finished.
-      env, features, policy: what the run was started with, where these were objects of the user's.
+      env, features, policy, schedule: what the run was started with, where these were objects of the user's.
 
     Raises:
       ValueError: a directory that is no run, or a file in it that is truncated or foreign.
     """
     log = RunDirectory.open(directory)
-    learner = _restored(log, env, features, policy)
+    learner = _restored(log, env, features, policy, schedule)
     log.drop_partial_line()
     log.write_summary(learner.state)  # a process killed between an event and its summary left an old one
     return learner.logged(log)
 
 
-def load(directory: Path | str, *, env: Any = None, features: Any = None, policy: Any = None) -> "Run":
-    """Read a run, finished or in progress, without changing it. Arguments and errors as of `resume`."""
+def load(
+    directory: Path | str, *, env: Any = None, features: Any = None, policy: Any = None, schedule: Any = None
+) -> "Run":
+    """Read a run, finished or in progress, without changing it. Arguments and errors as of `resume`.
+
+    A schedule of the user's own is only needed to go on, not to read.
+    """
     log = RunDirectory.open(directory)
-    return Run(log.path, _restored(log, env, features, policy))
+    if log.settings.schedule == "other" and schedule is None:
+        schedule = ConstantBound()
+    return Run(log.path, _restored(log, env, features, policy, schedule))
 
 
-def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any) -> Learner:
+def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedule: Any) -> Learner:
     settings = asdict(log.settings)
     name, kind = settings.pop("env"), settings.pop("policy")
-    for part, own, given in (("features", settings.pop("features"), features), ("policy", kind, policy)):
+    bounds = settings.pop("schedule")
+    for part, own, given in (
+        ("features", settings.pop("features"), features),
+        ("policy", kind, policy),
+        ("schedule", bounds, schedule),
+    ):
         if (own == "other") != (given is not None):
             had, expected = ("with", "it again as") if own == "other" else ("without", "no")
             raise ValueError(f"{log.path}: a run {had} {part} of the user's own: expected {expected} {part}=")
@@ -92,6 +113,7 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any) -> Lear
             name if env is None else env,
             features=features,
             policy=kind if policy is None else policy,
+            schedule=bounds if schedule is None else schedule,
             entries=log.entries(features=features, known=() if policy is None else (type(policy),)),
             **settings,
         )

@@ -11,6 +11,7 @@ LIKELIHOODS = ("mixed", "logistic", "probit")
 EXPERTS = ("return", "terminal", "other")
 POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
 FEATURES = ("drawn", "other")
+SCHEDULES = ("constant", "confidence", "other")
 HYPERPARAMETERS = ("evidence", "given")
 
 
@@ -23,6 +24,8 @@ class Settings:
       utility: how step 1 estimates the utility; `known-reward` is the ceiling: the hidden reward itself.
       iterations: cycles of the four steps.
       kl_bound: ε of eq. 11, nats.
+      schedule: what the bound of each iteration follows: `constant`, kl_bound itself; `confidence`, the posterior's
+        certainty that the update is an improvement; `other`, a schedule of the user's.
       likelihood: of an answer given the margin; `mixed` is eq. 8.
       prior_scale: σ, the prior's standard deviation of each utility weight.
       steepness: m of the likelihood, for differences divided by their largest absolute entry.
@@ -55,6 +58,7 @@ class Settings:
     utility: str = "posterior-mean"
     iterations: int = 25
     kl_bound: float = 0.3
+    schedule: str = "constant"
     likelihood: str = "mixed"
     prior_scale: float = 1.0
     steepness: float = 5.0
@@ -84,10 +88,13 @@ class Settings:
         _one_of("utility", self.utility, UTILITIES)
         _one_of("likelihood", self.likelihood, LIKELIHOODS)
         _one_of("query", self.query, QUERIES)
+        if self.schedule == "confidence" and self.utility in WITHOUT_POSTERIOR:
+            raise ValueError(f"schedule: expected constant with {self.utility}, no posterior, got {self.schedule!r}")
         if self.query != QUERIES[0] and self.utility in WITHOUT_POSTERIOR:
             raise ValueError(f"query: expected {QUERIES[0]} with {self.utility}, no posterior, got {self.query!r}")
         _one_of("policy", self.policy, POLICIES)
         _one_of("features", self.features, FEATURES)
+        _one_of("schedule", self.schedule, SCHEDULES)
         _one_of("hyperparameters", self.hyperparameters, HYPERPARAMETERS)
         for name in (
             "kl_bound",
