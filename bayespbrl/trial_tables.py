@@ -25,15 +25,24 @@ BALANCING_FILE = "balancing.json"
 def collect(directories: Sequence[Path | str]) -> xr.Dataset:
     """The summaries of finished runs as one data set over (seed, iteration).
 
-    Numbers and lists of numbers are kept, the latter with a dimension of their own; what is missing is NaN.
+    Numbers and lists of numbers are kept, the latter with a dimension of their own, and those of an entry that has
+    names in it, as `seconds` has, under both names: `seconds_utility`. What is missing is NaN.
     """
     summaries = [runs.read_summary(path) for path in directories]
     seeds = [summary["seed"] for summary in summaries]
     iterations = [entry["iteration"] for entry in summaries[0]["iterations"]]
+    rows = [[_flat(entry) for entry in summary["iterations"]] for summary in summaries]
+    skipped = {"iteration"} | {
+        name
+        for summary in summaries
+        for entry in summary["iterations"]
+        for name in entry
+        if isinstance(entry[name], dict)
+    }
     variables: dict[str, Any] = {}
-    for name in summaries[0]["iterations"][0]:
-        values = [[entry.get(name) for entry in summary["iterations"]] for summary in summaries]
-        if name != "iteration" and (figures := _figures(values)) is not None:
+    for name in dict.fromkeys(name for row in rows for entry in row for name in entry):
+        values = [[entry.get(name) for entry in row] for row in rows]
+        if name not in skipped and (figures := _figures(values)) is not None:
             variables[name] = (("seed", "iteration", f"{name}_dimension")[: figures.ndim], figures)
     if all(has_balancing(path) for path in directories):
         lasted = [json.loads((Path(path) / BALANCING_FILE).read_text()) for path in directories]
@@ -43,11 +52,18 @@ def collect(directories: Sequence[Path | str]) -> xr.Dataset:
     return xr.Dataset(variables, {"seed": seeds, "iteration": iterations}, attributes)
 
 
+def _flat(entry: dict[str, Any]) -> dict[str, Any]:
+    inner = {
+        f"{name}_{key}": part for name, value in entry.items() if isinstance(value, dict) for key, part in value.items()
+    }
+    return {name: value for name, value in entry.items() if not isinstance(value, dict)} | inner
+
+
 def _figures(values: Sequence[Sequence[Any]]) -> np.ndarray | None:
     """Numbers, or lists of numbers that are all as long, as one array; None for anything else."""
     flat = [value for row in values for value in row if value is not None]
     lengths = {len(value) if isinstance(value, list) else 0 for value in flat}
-    if len(lengths) > 1 or any(isinstance(value, str | dict) for value in flat):
+    if len(lengths) > 1 or not all(isinstance(value, int | float | list) for value in flat):
         return None
     missing = [np.nan] * length if (length := max(lengths, default=0)) else np.nan
     return np.array([[missing if value is None else value for value in row] for row in values])

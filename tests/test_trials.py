@@ -60,6 +60,8 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
                 "scale": None if i == 1 else 0.5,
                 "spread": [i, 10.0 * seed],
                 "kind": "x",
+                "seconds": {"utility": 0.1 * i, "kind": "y"},
+                "chosen": None if i == 1 else {"multiples": [1.0, 2.0, i]},
             }
             for i in (1, 2, 3)
         ]
@@ -67,7 +69,10 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
         (tmp_path / str(seed)).mkdir()
         (tmp_path / str(seed) / "summary.json").write_text(json.dumps(summary))
     table = collect([tmp_path / "1", tmp_path / "2"])
-    assert set(table.data_vars) == {"value", "scale", "spread"}
+    assert set(table.data_vars) == {"value", "scale", "spread", "seconds_utility", "chosen_multiples"}
+    np.testing.assert_allclose(table["seconds_utility"], 2 * [[0.1, 0.2, 0.3]])
+    assert table["chosen_multiples"].sel(seed=1, iteration=3).values.tolist() == [1, 2, 3]
+    assert table["chosen_multiples"].sel(seed=1, iteration=1).isnull().all()
     np.testing.assert_array_equal(table["value"], [[2, 3, 4], [3, 4, 5]])
     np.testing.assert_array_equal(table["scale"], 2 * [[np.nan, 0.5, 0.5]])
     assert table["spread"].shape == (2, 3, 2)
