@@ -7,7 +7,7 @@ from gymnasium.spaces import Box, Discrete
 
 from bayespbrl import improvement
 from bayespbrl.features import OneHot, StateActionProduct
-from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, TabularPolicy, sample_actions
+from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, TabularPolicy, sample_actions
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
 
 STATES, ACTIONS, DISCOUNT = 6, 3, 0.9
@@ -210,6 +210,28 @@ def test_a_continuous_policy_moves_towards_the_better_actions(kind):
         update.policy.action_standard_deviation(states).mean(axis=0)
     )
     assert update.action_standard_deviation[0] < policy.action_standard_deviation(states).mean()
+
+
+def test_discrete_actions_in_continuous_states_leave_every_state_its_weight():
+    rng = np.random.default_rng(3)
+    states, actions = rng.uniform(-1, 1, size=(400, 2)), rng.integers(0, 2, 400)
+    steps = Transitions(states, actions, rng.uniform(-1, 1, (400, 2)), np.zeros(400), np.ones(400, bool))
+    better = np.where(states[:, 0] > 0, actions, 1 - actions)  # and far more depends on the state than on the action
+    update = improve(
+        SoftmaxPolicy.initial(OBSERVATIONS, Discrete(2)),
+        steps,
+        better + 20 * states[:, 1],
+        action_space=Discrete(2),
+        state_features=lambda states: states,  # in these alone the weights could move from state to state
+        state_action_features=StateActionProduct(lambda s: np.column_stack([s > 0, s, np.ones(len(s))]), 2),
+        discount=0.0,
+    )
+    np.testing.assert_allclose(update.reps.probabilities.reshape(400, 2).sum(axis=1), 1 / 400, rtol=1e-12)
+    assert update.reps.kl == pytest.approx(0.3, rel=1e-6)
+    assert update.kl_fitted_policy == pytest.approx(0.3, rel=0.15)
+    chances = update.policy.probabilities(np.array([[0.7, 0.0], [-0.7, 0.0]]))[:, 1]
+    assert chances[0] > 0.8
+    assert chances[1] < 0.2
 
 
 def test_continuous_actions_are_kept_within_the_bounds_and_discrete_ones_as_they_are():
