@@ -21,6 +21,7 @@ from bayespbrl.diagnostics.uncertainty import (
     ranking_probabilities,
     return_draws,
     successor_features,
+    thinned,
 )
 from bayespbrl.features import OneHot
 from bayespbrl.improvement import estimate_q
@@ -81,6 +82,17 @@ def test_the_probability_to_be_better_matches_quadrature_over_the_only_margin():
     assert float(ranking["better_probability"][0, 1] + ranking["better_probability"][0, 2]) == pytest.approx(
         1.0, abs=0.05
     )
+
+
+def test_a_thinned_estimate_has_the_draws_that_fewer_draws_are():
+    estimate = fitted()
+    some = thinned(estimate, 40)
+    np.testing.assert_array_equal(some.draws(np.eye(3)), estimate.draws(np.eye(3), number=40))
+    sizes = some.posterior["posterior"].sizes
+    assert some.posterior["sample_stats"].sizes["draw"] == sizes["draw"] == 40 / sizes["chain"]
+    np.testing.assert_array_equal(some.weights, estimate.weights)
+    with pytest.raises(ValueError, match="number: expected at least 1 draw, got 0"):
+        thinned(estimate, 0)
 
 
 # Rankings.

@@ -7,6 +7,7 @@ Results are in units of the utility, which answers fix up to a positive factor o
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -260,6 +261,19 @@ def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="action", ylabel="state", title=_titled("Best action", greedy))
     return axes
+
+
+def thinned(estimate: Any, number: int) -> Any:
+    """The estimate with at most `number` draws, evenly spaced over the chains, and at least one a chain.
+
+    Raises:
+      ValueError: an estimate without a posterior; a number < 1.
+    """
+    if number < 1:
+        raise ValueError(f"number: expected at least 1 draw, got {number}")
+    sizes = _with_posterior(estimate).posterior.children["posterior"].sizes
+    apart = -(-sizes["chain"] * sizes["draw"] // number)
+    return replace(estimate, posterior=estimate.posterior.isel(draw=slice(None, None, apart)))
 
 
 def _with_posterior(estimate: Any) -> Any:
