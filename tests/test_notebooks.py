@@ -9,7 +9,7 @@ from nbclient import NotebookClient
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 LARGEST = 300_000  # bytes
 # What a notebook is about having of one's own does not belong in the package.
-OWN = {"04_your_own_environment": ["features", "expert"]}
+OWN = {"03_uncertainty_and_exploration": ["cautious"], "04_your_own_environment": ["features", "expert"]}
 # An absolute path of two parts or more (not an address), or one with a drive's letter.
 MACHINE_PATH = re.compile(r"(?<![\w.:/)])/\w[\w.-]*/\w[^\s\"]*|\b[A-Z]:\\\\\w+")
 
