@@ -150,7 +150,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     # reaches 0.99 at answer 10 and with 0.995 at answer 8; the median does by answer 6 or 7 with each. Steepness 1 or
     # 5, a lapse rate of 0.1, the logistic likelihood, and bounds of 0.15, 0.2 and 0.5 in place of 0.3 made no such
     # difference.
-    "gridworld": {"iterations": 25, "discount": 0.995},
+    # hyperparameters: one-hot features have no length scale, and choosing steepness and lapse rate by evidence puts off
+    # the lower quartile's 0.99 on the same seeds from answer 8 to 13.
+    "gridworld": {"iterations": 25, "discount": 0.995, "hyperparameters": "given"},
     # kl_bound, ridges: the paper's authors'. Half the median rule: with the known reward, seeds 0 and 1, a quarter and
     # a half end alike (-950 to -1000), and the whole rule had reached -1900 by iteration 9. 300 centres, not 700: the
     # same end for a quarter of the time. The last four iterations' states: those of all hold the bound back late in a
