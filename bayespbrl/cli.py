@@ -134,6 +134,13 @@ def trials(
         study = run_trials(env, directory, trials=number, jobs=jobs, progress=lambda _: bar.advance(task), **options)
         bar.update(task, completed=number)
     _print_trials(study)
+    from bayespbrl.diagnostics.plots import trials_figure
+    from bayespbrl.rollouts import open_environment
+
+    title = f"{env}, {study.table.attrs['utility']}, {number} trials"
+    picture = directory / "trials.png"
+    trials_figure(study.quartiles(), open_environment(env), title).savefig(picture, dpi=110)
+    console.print(f"Picture: {picture}")
 
 
 def main() -> None:

@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 
 from bayespbrl import diagnostics
 from bayespbrl.diagnostics import convergence, plot_convergence, plot_ranks
+from bayespbrl.diagnostics.plots import trials_figure
+from bayespbrl.rollouts import open_environment
 
 
 def tree_of(margins):
@@ -98,3 +100,24 @@ def test_ranks_are_level_where_chains_agree_and_pile_up_where_one_does_not(draws
 def test_a_preference_that_there_is_not_is_refused(draws, preference):
     with pytest.raises(ValueError, match=r"preference: expected a number in 0 … 2, got -?\d"):
         plot_ranks(tree_of(draws), Figure().subplots(), preference=preference)
+
+
+def test_the_curve_over_trials_shows_median_quartiles_and_published_levels():
+    curve = xr.Dataset(
+        {
+            "answers": ("iteration", [2.0, 3.0]),
+            "lower_quartile": ("iteration", [-3.0, -2.0]),
+            "median": ("iteration", [-2.0, -1.0]),
+            "upper_quartile": ("iteration", [-1.0, -0.5]),
+        },
+        {"iteration": [1, 2]},
+    )
+    environment = open_environment("acrobot")
+    (axes,) = trials_figure(curve, environment, "acrobot").axes
+    median, *levels = axes.lines
+    np.testing.assert_array_equal(median.get_xydata(), [[2, -2], [3, -1]])
+    assert [line.get_ydata()[0] for line in levels] == [-211.3, -385.2]
+    band = axes.collections[0].get_paths()[0].get_extents()
+    assert (band.y0, band.y1) == (-3.0, -0.5)
+    (axes,) = trials_figure(curve, open_environment("gridworld"), "gridworld").axes
+    assert axes.lines[1].get_ydata()[0] == 294.8125

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -26,6 +27,41 @@ def learning_curve(iterations: Sequence[Mapping[str, Any]], axes: Axes, *, optim
         axes.annotate("optimal", (0.02, optimum), xycoords=("axes fraction", "data"), va="bottom", color="0.4")
     axes.set(xlabel="answers", ylabel="value (mean return)", title="Learning curve")
     return axes
+
+
+def quartile_curve(quartiles: xr.Dataset, axes: Axes, *, levels: Mapping[str, float] | None = None) -> Axes:
+    """Median of the value over trials against answers, with the band between the quartiles.
+
+    Args:
+      quartiles: as `Trials.quartiles` gives them: answers, lower_quartile, median, upper_quartile by iteration.
+      axes: to draw on.
+      levels: horizontal lines by name, of what others have published or of the optimum.
+    """
+    answers = quartiles["answers"]
+    axes.fill_between(
+        answers, quartiles["lower_quartile"], quartiles["upper_quartile"], alpha=0.25, linewidth=0, label="quartiles"
+    )
+    axes.plot(answers, quartiles["median"], marker="o", markersize=3, label="median")
+    for name, level in (levels or {}).items():
+        axes.axhline(level, color="0.5", linestyle="--", linewidth=1)
+        axes.annotate(name, (0.98, level), xycoords=("axes fraction", "data"), va="bottom", ha="right", color="0.4")
+    axes.set(xlabel="answers", ylabel="value (mean return)")
+    axes.legend(loc="lower right")
+    return axes
+
+
+def trials_figure(quartiles: xr.Dataset, environment: Any, title: str) -> Figure:
+    """`quartile_curve` with the levels that the environment knows: its optimum, and returns published by others."""
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    dynamics = getattr(environment.unwrapped, "dynamics", None)
+    levels = dict(getattr(dynamics, "published_returns", {}))
+    optimum = getattr(dynamics, "optimal_return", None)
+    axes = quartile_curve(
+        quartiles, figure.subplots(), levels=levels | ({} if optimum is None else {"optimal": optimum})
+    )
+    axes.set_title(title)
+    return figure
 
 
 def utility_beside_reward(learner: Learner, utility_axes: Axes, reward_axes: Axes) -> tuple[Axes, Axes]:

@@ -38,6 +38,7 @@ class AcrobotDynamics(FuncEnv):
     observation_space = Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT, dtype=np.float64)
     action_space = Box(-MAX_TORQUE, MAX_TORQUE, (1,), dtype=np.float64)
     max_episode_steps = 500
+    published_returns: tuple[tuple[str, float], ...] = (("LP, as published", -211.3), ("EPMC, as published", -385.2))
     observation_period: tuple[float, ...] = (2 * np.pi, 2 * np.pi, np.inf, np.inf)
     frames_per_second = 1 / (SUBSTEPS * SUBSTEP_SECONDS)
 
