@@ -30,8 +30,10 @@ ONE_HOT = OneHot(3)
 def test_the_answers_are_explained(method):
     estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method=method, discount=0.9)
     utilities = estimate.utilities(np.arange(3))
-    assert utilities[0] < utilities[2]
-    assert method == "linear-program" or utilities[0] < utilities[1] < utilities[2]  # one of many optimal corners
+    if method != "posterior-draw":  # eq. 8 leaves a single draw some chance to contradict an answer
+        assert utilities[0] < utilities[2]
+    if method in ("posterior-mean", "most-likely"):  # the program's solution is one of many optimal corners
+        assert utilities[0] < utilities[1] < utilities[2]
     assert estimate.quality.pairs == 2
     assert estimate.quality.pairs_satisfied == sum(
         estimate.utilities(np.array([i]))[0] > estimate.utilities(np.array([j]))[0] for i, j in PAIRS
