@@ -11,11 +11,11 @@ from bayespbrl import events, improvement, queries, rollouts, schedules, utility
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
-from bayespbrl.features import checked_features, draw_state_action_features, draw_state_features
+from bayespbrl.features import StateActionFeatures, checked_features, draw_state_action_features, draw_state_features
 from bayespbrl.policies.choice import initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
 from bayespbrl.settings import Settings, settings_for
-from bayespbrl.trajectories import Trajectory, transitions
+from bayespbrl.trajectories import Trajectory, Transitions, transitions
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
 COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE = range(7)
@@ -286,16 +286,7 @@ class Learner:
         """Step 2, by as much as the schedule allows once it has seen what an update would do."""
         settings, iteration = self.settings, self.state.iteration
         rng = self._rng(FEATURES, 2 * iteration + 1)
-        state_action_features = draw_state_action_features(
-            self.environment.observation_space,
-            self.environment.action_space,
-            steps.states,
-            steps.actions,
-            rng=rng,
-            number_of_centres=settings.centres,
-            bandwidth_factor=settings.bandwidth_factor,
-            period=self._period,
-        )
+        state_action_features = self.state_action_features(steps, rng=rng)
         bounds: list[schedules.Bound] = []
 
         def decide(update: improvement.ProposedUpdate) -> float:
@@ -322,6 +313,19 @@ class Learner:
             utility_draws=self._utility_draws(estimate, steps),
         )
         return improved, bounds[-1]
+
+    def state_action_features(self, steps: Transitions, *, rng: np.random.Generator) -> StateActionFeatures:
+        """φ(s, a) of Q, drawn at observed transitions as the settings say."""
+        return draw_state_action_features(
+            self.environment.observation_space,
+            self.environment.action_space,
+            steps.states,
+            steps.actions,
+            rng=rng,
+            number_of_centres=self.settings.centres,
+            bandwidth_factor=self.settings.bandwidth_factor,
+            period=self._period,
+        )
 
     def _utility_draws(self, estimate: Any, steps: Any) -> np.ndarray | None:
         """Utilities of each step under some posterior draws, (N, S); None where no schedule asks or none are there."""

@@ -223,15 +223,15 @@ def choose_hyperparameters(
         return HyperparameterChoice(features, steepness, lapse_rate, start[:dimensions], 0.0, 0.0, 1.0, 1)
     axes = [*[BANDWIDTH_MULTIPLES] * dimensions, STEEPNESS_MULTIPLES, sorted({*LAPSE_RATES, float(lapse_rate)})]
     search = search_hyperparameters(candidate, axes, start=start, together=dimensions)
-    reached = int(np.flatnonzero((search.points == search.best).all(axis=1))[0])
+    log_evidence = search.weighed.log_evidence
     return HyperparameterChoice(
         with_bandwidths(search.best[:dimensions]),
         steepness * search.best[dimensions],
         search.best[dimensions + 1],
         search.best[:dimensions],
-        float(search.weighed.log_evidence[reached]),
-        float(search.weighed.log_evidence[reached] - search.weighed.log_evidence[0]),
-        float(search.weighed.weights[reached]),
+        float(log_evidence[search.reached]),
+        float(log_evidence[search.reached] - log_evidence[0]),
+        float(search.weighed.weights[search.reached]),
         len(search.points),
     )
 

@@ -18,10 +18,8 @@ from bayespbrl.envs.opening import open_environment
 from bayespbrl.features import checked_features
 from bayespbrl.preferences import Preferences
 from bayespbrl.runs import RunDirectory, read_parts
-from bayespbrl.settings import Settings
+from bayespbrl.settings import WITHOUT_POSTERIOR, Settings
 from bayespbrl.trajectories import Trajectory, trajectory_features
-
-WITHOUT_POSTERIOR = ("linear-program", "known-reward")
 
 
 @dataclass(frozen=True)

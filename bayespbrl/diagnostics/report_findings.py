@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.diagnostics.report_evidence import WITHOUT_POSTERIOR, Evidence
+from bayespbrl.diagnostics.report_evidence import Evidence
+from bayespbrl.settings import WITHOUT_POSTERIOR
 
 
 def learnt(

@@ -11,9 +11,10 @@ from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ran
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.prequential import plot_calibration
 from bayespbrl.diagnostics.report_document import Section, Table, drawn
-from bayespbrl.diagnostics.report_evidence import WITHOUT_POSTERIOR, Evidence
+from bayespbrl.diagnostics.report_evidence import Evidence
 from bayespbrl.diagnostics.report_findings import cell, figure, no_posterior
 from bayespbrl.diagnostics.uncertainty import thinned
+from bayespbrl.settings import WITHOUT_POSTERIOR
 
 RANKED = 4
 

@@ -9,7 +9,7 @@ from gymnasium.spaces import Discrete
 
 from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report_evidence import Evidence
-from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws, thinned
+from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws
 from bayespbrl.preferences import Answer
 
 MEASURED = (
@@ -128,7 +128,7 @@ def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
     if states.ndim == 1:
         data["visits"] = ("state", np.bincount(states, minlength=len(shown)))
     if evidence.posterior is not None:
-        draws = thinned(estimate, DRAWS).draws(features).reshape(-1, len(shown))
+        draws = estimate.draws(features, number=DRAWS).reshape(-1, len(shown))
         chosen = np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)
         mean = np.asarray(evidence.posterior["utility_weights_mean"]) / estimate.scale
         data["mean"], data["sd"] = ("state", features @ mean), ("state", draws.std(axis=0))

@@ -18,7 +18,6 @@ from matplotlib.ticker import MaxNLocator
 from scipy.stats import rankdata
 
 from bayespbrl.cycle import Learner
-from bayespbrl.features import draw_state_action_features
 from bayespbrl.improvement import QFunction, estimate_q
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
 
@@ -104,25 +103,15 @@ def successor_features(learner: Learner, *, seed: int = 0) -> QFunction:
     Source: Dayan (1993), "Improving generalization for temporal difference learning: the successor representation".
     """
     features = _with_posterior(learner.estimate).features
-    settings, environment = learner.settings, learner.environment
+    settings = learner.settings
     steps = transitions(learner.trajectories)
-    state_action_features = draw_state_action_features(
-        environment.observation_space,
-        environment.action_space,
-        steps.states,
-        steps.actions,
-        rng=np.random.default_rng(seed),
-        number_of_centres=settings.centres,
-        bandwidth_factor=settings.bandwidth_factor,
-        period=getattr(getattr(environment.unwrapped, "dynamics", None), "observation_period", None),
-    )
     return estimate_q(
         learner.policy,
         steps,
         features(steps.next_states),
         key=jax.random.key(seed),
-        action_space=environment.action_space,
-        features=state_action_features,
+        action_space=learner.environment.action_space,
+        features=learner.state_action_features(steps, rng=np.random.default_rng(seed)),
         discount=settings.discount,
         fixed_point_ridge=settings.fixed_point_ridge,
         projection_ridge=settings.projection_ridge,

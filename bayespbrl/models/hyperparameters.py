@@ -88,12 +88,17 @@ class HyperparameterSearch:
     Attributes:
       points: the settings that were examined, in their order, shape (C, axes).
       weighed: what the answers say about them.
-      best: where the climb ended.
+      reached: index of the point where the climb ended.
     """
 
     points: np.ndarray
     weighed: HyperparameterWeights
-    best: tuple[float, ...]
+    reached: int
+
+    @property
+    def best(self) -> tuple[float, ...]:
+        """The setting where the climb ended."""
+        return tuple(self.points[self.reached].tolist())
 
 
 def search_hyperparameters(
@@ -158,5 +163,5 @@ def search_hyperparameters(
             log_evidence,
             np.concatenate([weighed.converged for weighed in found.values()]),
         ),
-        best=best,
+        reached=list(found).index(best),
     )
