@@ -184,7 +184,7 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
             Mixed(5.0, 6.0),
             prior_scale=1.7,
             mean=np.arange(6.0),
-            covariance=np.diag(1 + np.arange(6.0)),
+            site_precisions=1 + np.arange(6.0),
         )
         kernel = posterior.EllipticalSlice(low_rank_model)
         z = np.random.default_rng(0).standard_normal((20, 8))
@@ -194,6 +194,7 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
         residual = np.asarray(reference.residual(jax.vmap(reference.lift)(z)))
         inside = stats.multivariate_normal(problem.centre, problem.root @ problem.root.T).logpdf(z)
         np.testing.assert_allclose(np.diff(residual), np.diff(joint - inside), rtol=1e-9)
+        np.testing.assert_allclose(jax.vmap(lambda x: reference.lower(reference.lift(x)))(z), z, atol=1e-12)
         np.testing.assert_allclose(prior.residual(jax.vmap(prior.lift)(z)), likelihood, rtol=1e-9)
 
 

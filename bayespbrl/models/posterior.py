@@ -199,17 +199,14 @@ class _Chains:
     @classmethod
     def start(cls, fit: GaussianFit, *, num_chains: int, chunk: int, seed: int) -> "_Chains":
         loadings, approximation = fit.factors.loadings, fit.approximation
-        used = np.any(loadings != 0, axis=1)
-        rank = loadings.shape[1]
-        weighted = loadings[used].T * (REFERENCE_POWER * approximation.site_precisions)
-        precision = np.eye(rank) + fit.prior_scale**2 * weighted @ loadings[used]
-        covariance = fit.prior_scale**2 * np.linalg.inv(precision)
+        site_precisions = np.zeros(len(loadings))
+        site_precisions[np.any(loadings != 0, axis=1)] = REFERENCE_POWER * approximation.site_precisions
         problem = padded_problem(
             loadings,
             fit.likelihood,
             prior_scale=fit.prior_scale,
             mean=approximation.mean,
-            covariance=(covariance + covariance.T) / 2,
+            site_precisions=site_precisions,
         )
         # from the reference, which is wider than the posterior's bulk: those that agree have forgotten their start
         noise = np.random.default_rng(seed).standard_normal((num_chains, len(problem.centre)))
@@ -217,7 +214,7 @@ class _Chains:
         start, zeros = jnp.asarray(start), jnp.zeros(num_chains)
         keys = jax.random.split(jax.random.key(seed), num_chains)
         state = EllipticalSliceState({"utility_weights": start}, zeros, zeros, zeros.astype(bool), keys)
-        return cls(problem, state, chunk, rank, len(loadings))
+        return cls(problem, state, chunk, loadings.shape[1], len(loadings))
 
     @property
     def length(self) -> int:

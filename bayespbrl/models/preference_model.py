@@ -49,8 +49,9 @@ class PreferenceProblem:
       used: rows that carry an answer with a margin other than exactly zero, shape (c,) bool.
       likelihood: p; its arrays padded too.
       prior_scale: σ.
-      centre, root: mean m and Cholesky factor A of the reference's covariance, shapes (c,) and (c, c).
-      inverse_root: A⁻¹.
+      centre: mean m of the reference, shape (c,).
+      site_precisions: s of the reference's precision I/σ² + Lᵀ diag(s) L, shape (c,).
+      root, inverse_root: A, with AAᵀ the reference's covariance, and A⁻¹, shapes (c, c).
     """
 
     loadings: jax.Array
@@ -58,6 +59,7 @@ class PreferenceProblem:
     likelihood: Likelihood
     prior_scale: float
     centre: jax.Array
+    site_precisions: jax.Array
     root: jax.Array
     inverse_root: jax.Array
 
@@ -68,31 +70,30 @@ def low_rank_model(problem: PreferenceProblem) -> None:
 
 
 def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
-    """Ellipses of N(m, AAᵀ); v = (L(z − m), z − m, A⁻¹(z − m)), so that a candidate costs O(K + r)."""
+    """Ellipses of N(m, AAᵀ) with v = (L(z − m), mᵀ(z − m)/σ², A⁻¹(z − m)), so that a candidate costs O(K).
+
+    The reference differs from the prior by one Gaussian factor an answer, so that their ratio needs the margins alone:
+    log N(z; 0, σ²I) − log N(z; m, AAᵀ) = ½ Σ s_k (L(z − m))_k² − mᵀ(z − m)/σ² + a constant.
+    """
     loadings, centre = problem.loadings, problem.centre
-    number, rank = loadings.shape
-    map_noise = jnp.concatenate([loadings @ problem.root, problem.root])
+    number = len(loadings)
+    map_displacement = jnp.concatenate([loadings, centre[None] / problem.prior_scale**2])
+    map_noise = (map_displacement @ problem.root).T
     margins_at_centre = loadings @ centre
 
     def lift(z):
-        return jnp.concatenate([loadings @ (z - centre), z - centre, problem.inverse_root @ (z - centre)])
+        return jnp.concatenate([map_displacement @ (z - centre), problem.inverse_root @ (z - centre)])
 
     def residual(v):
-        margins, displacements, whitened = v[:, :number], v[:, number : number + rank], v[:, number + rank :]
+        margins, tilt = v[:, :number], v[:, number]
         log_likelihood = total_log_prob(problem.likelihood, margins_at_centre + margins, problem.used)
-        prior = jnp.sum((centre + displacements) ** 2, axis=-1) / problem.prior_scale**2
-        return log_likelihood + 0.5 * (jnp.sum(whitened**2, axis=-1) - prior)
+        return log_likelihood + 0.5 * jnp.sum(problem.site_precisions * margins**2, axis=-1) - tilt
 
     def noise(key, moves):
-        whitened = random.normal(key, (moves, rank), dtype=loadings.dtype)
-        return jnp.concatenate([whitened @ map_noise.T, whitened], axis=1)
+        whitened = random.normal(key, (moves, number), dtype=loadings.dtype)
+        return jnp.concatenate([whitened @ map_noise, whitened], axis=1)
 
-    return Ellipse(
-        lift,
-        noise,
-        residual,
-        lambda v: centre + v[number : number + rank],
-    )
+    return Ellipse(lift, noise, residual, lambda v: centre + problem.root @ v[number + 1 :])
 
 
 def prior_ellipse(problem: PreferenceProblem) -> Ellipse:
@@ -113,36 +114,40 @@ def padded_problem(
     *,
     prior_scale: float,
     mean: np.ndarray,
-    covariance: np.ndarray,
+    site_precisions: np.ndarray,
 ) -> PreferenceProblem:
-    """Pad K answers and rank r to a capacity: a power of two, at least 8, or three quarters of one above 64.
-
-    Padded coordinates keep the prior.
+    """Pad K answers and rank r to a capacity; padded coordinates keep the prior.
 
     Args:
       loadings: L, shape (K, r); rows of exactly zero are not used.
       likelihood: p.
       prior_scale: σ.
-      mean, covariance: of the reference, shapes (r,) and (r, r).
+      mean: of the reference, shape (r,).
+      site_precisions: s >= 0 of the reference's precision I/σ² + Lᵀ diag(s) L, shape (K,).
     """
     number, rank = loadings.shape
-    capacity = max(8, 1 << (max(number, 1) - 1).bit_length())
-    # above 64 the padding costs more than the compilation that a step between two powers saves
-    capacity = 3 * capacity // 4 if capacity > 64 and number <= 3 * capacity // 4 else capacity
-    padded, used = np.zeros((capacity, capacity)), np.zeros(capacity, dtype=bool)
-    padded[:number, :rank] = loadings
+    capacity = _capacity(number)
+    precisions, used = np.zeros(capacity), np.zeros(capacity, dtype=bool)
     used[:number] = np.any(loadings != 0, axis=1)
-    root = prior_scale * np.eye(capacity)
-    inverse_root = np.eye(capacity) / prior_scale
+    precisions[:number] = site_precisions
+    padded, centre = np.zeros((capacity, capacity)), np.zeros(capacity)
+    padded[:number, :rank], centre[:rank] = loadings, mean
+    root, inverse_root = prior_scale * np.eye(capacity), np.eye(capacity) / prior_scale
     if rank:
-        root[:rank, :rank] = np.linalg.cholesky(covariance)
-        inverse_root[:rank, :rank] = np.linalg.inv(root[:rank, :rank])
-    centre = np.zeros(capacity)
-    centre[:rank] = mean
-    arrays = [jnp.asarray(a) for a in (padded, used, centre, root, inverse_root)]
+        precision = np.eye(rank) / prior_scale**2 + loadings.T @ (site_precisions[:, None] * loadings)
+        inverse_root[:rank, :rank] = np.linalg.cholesky(precision).T
+        root[:rank, :rank] = np.linalg.inv(inverse_root[:rank, :rank])
+    arrays = [jnp.asarray(a) for a in (padded, used, centre, precisions, root, inverse_root)]
     return PreferenceProblem(
         arrays[0], arrays[1], padded_likelihood(likelihood, capacity), float(prior_scale), *arrays[2:]
     )
+
+
+def _capacity(number: int) -> int:
+    """A power of two, at least 8; above 64, where padding costs more than the compilation it saves, in quarter steps."""
+    power = max(8, 1 << (max(number, 1) - 1).bit_length())
+    step = power // 8
+    return power if power <= 64 else -(-number // step) * step
 
 
 def padded_likelihood(likelihood: Likelihood, capacity: int) -> Likelihood:
