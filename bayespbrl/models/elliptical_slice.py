@@ -21,6 +21,9 @@ from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import compute_log_probs
 from numpyro.util import is_prng_key
 
+# So many batches of candidate angles are drawn for all moves at once; a move that needs more draws them itself, which
+# costs as much as three batches.
+BATCHES_AHEAD = 2
 GAUSSIANS = (dist.Normal, dist.MultivariateNormal, dist.LowRankMultivariateNormal, dist.GaussianRandomWalk)
 
 
@@ -92,51 +95,53 @@ def elliptical_moves(
 
     `batch` candidates are evaluated at once, `max_candidates` at most; a move without an acceptable one stays.
     """
+    ahead = max(1, min(BATCHES_AHEAD, -(-max_candidates // batch)))
     key_noise, key_uniform, key_more = random.split(key, 3)
     v = ellipse.lift(x)
     noise = ellipse.noise(key_noise, moves)
-    uniforms = random.uniform(key_uniform, (moves, batch + 1), dtype=x.dtype)
+    uniforms = random.uniform(key_uniform, (moves, ahead * batch + 1), dtype=x.dtype)
     first = 2 * jnp.pi * uniforms[:, 1]
     rest, low, high = shrink(first, first - 2 * jnp.pi, first, uniforms[:, 2:])
-    angles = jnp.concatenate([first[:, None], rest], axis=1)
+    angles = jnp.concatenate([first[:, None], rest], axis=1).reshape(moves, ahead, batch)
 
-    def move(v, drawn):
-        noise, level, angles, low, high, key = drawn
+    def move(carry, drawn):
+        (v, value), (noise, level, angles, low, high, key) = carry, drawn
+        level = value + level
 
-        def at(cosine, sine):
+        def first_accepted(angles):
+            """Whether there is one, how many were tried, its angle and its residual."""
             axes = (slice(None),) + (None,) * v.ndim
-            return v * cosine[axes] + noise * sine[axes]
+            values = ellipse.residual(v * jnp.cos(angles)[axes] + noise * jnp.sin(angles)[axes])
+            # NaN compares as false, so that a NaN candidate is rejected
+            accepted = values > level
+            best, found = jnp.argmax(accepted), jnp.any(accepted)
+            return found, jnp.where(found, best + 1, batch), angles[best], values[best]
 
-        # the current point in the same batch as the first candidates
-        values = ellipse.residual(
-            at(jnp.append(1.0, jnp.cos(angles)).astype(v.dtype), jnp.append(0.0, jnp.sin(angles)).astype(v.dtype))
-        )
-        # a current point that is impossible or NaN is left for any that is possible
-        level = jnp.where(values[0] > -jnp.inf, values[0], -jnp.inf) + level
-        # NaN compares as false, so that a NaN candidate is rejected
-        accepted = values[1:] > level
+        def drawn_ahead(state):
+            batches, _, tried, *_ = state
+            found, more, angle, there = first_accepted(angles[batches])
+            return batches + 1, found, tried + more, angle, there
 
-        def more(state):
-            found, tried, *_ = state
-            return ~found & (tried < max_candidates)
-
-        def next_batch(state):
-            _, tried, last, low, high, _ = state
+        def drawn_now(state):
+            last, low, high, _, tried, *_ = state
             fresh = random.uniform(random.fold_in(key, tried), (batch,), dtype=v.dtype)
-            angles, low, high = shrink(last, low, high, fresh)
-            accepted = ellipse.residual(at(jnp.cos(angles), jnp.sin(angles))) > level
-            best = jnp.argmax(accepted)
-            found = jnp.any(accepted)
-            return found, tried + jnp.where(found, best + 1, batch), angles[-1], low, high, angles[best]
+            candidates, low, high = shrink(last, low, high, fresh)
+            found, more, angle, there = first_accepted(candidates)
+            return candidates[-1], low, high, found, tried + more, angle, there
 
-        best, found = jnp.argmax(accepted), jnp.any(accepted)
-        start = (found, jnp.where(found, best + 1, batch), angles[-1], low, high, angles[best])
-        found, tried, _, _, _, angle = lax.while_loop(more, next_batch, start)
-        angle = jnp.where(found, angle, 0.0)
-        return v * jnp.cos(angle) + noise * jnp.sin(angle), (tried, ~found)
+        nothing = (jnp.zeros((), bool), jnp.zeros((), int), jnp.zeros((), v.dtype), value)
+        _, *state = lax.while_loop(lambda s: ~s[1] & (s[0] < ahead), drawn_ahead, (0, *nothing))
+        start = (angles[-1, -1], low, high, *state)
+        state = lax.while_loop(lambda s: ~s[3] & (s[4] < max_candidates), drawn_now, start)
+        found, tried, angle, there = state[3:]
+        angle, value = jnp.where(found, angle, 0.0), jnp.where(found, there, value)
+        return (v * jnp.cos(angle) + noise * jnp.sin(angle), value), (tried, ~found)
 
+    # a current point that is impossible or NaN is left for any that is possible
+    value = ellipse.residual(v[None])[0]
+    value = jnp.where(value > -jnp.inf, value, -jnp.inf)
     drawn = (noise, jnp.log(uniforms[:, 0]), angles, low, high, random.split(key_more, moves))
-    v, (tried, stuck) = lax.scan(move, v, drawn)
+    (v, _), (tried, stuck) = lax.scan(move, (v, value), drawn)
     return ellipse.lower(v), jnp.sum(tried), jnp.any(stuck)
 
 

@@ -48,10 +48,14 @@ def log_prob(likelihood: Likelihood, margins: jax.Array) -> jax.Array:
     return exponent + jnp.log(ratio)
 
 
-def total_log_prob(likelihood: Likelihood, margins: jax.Array, used: jax.Array) -> jax.Array:
-    """Σ log p over the answers where `used`, margins of shape (..., K). One logarithm for 32 answers: it costs most."""
+def total_log_prob(likelihood: Likelihood, margins: jax.Array, used: jax.Array | None = None) -> jax.Array:
+    """Σ log p over the answers where `used`, all when None; margins of shape (..., K).
+
+    One logarithm for 32 answers: it costs most.
+    """
     exponent, ratio = likelihood.factor(margins)
-    exponent, ratio = jnp.where(used, exponent, 0), jnp.where(used, ratio, 1)
+    if used is not None:
+        exponent, ratio = jnp.where(used, exponent, 0), jnp.where(used, ratio, 1)
     ratio = jnp.pad(ratio, [(0, 0)] * (ratio.ndim - 1) + [(0, -ratio.shape[-1] % 32)], constant_values=1)
     groups = jnp.prod(ratio.reshape(*ratio.shape[:-1], -1, 32), axis=-1)
     return jnp.sum(exponent, axis=-1) + jnp.sum(jnp.log(groups), axis=-1)

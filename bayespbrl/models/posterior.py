@@ -29,9 +29,9 @@ from bayespbrl.models.preference_model import (
 # posterior's bulk and its residual has no bound in the tails; towards none it is the prior, which mixes badly.
 REFERENCE_POWER = 0.6
 # Moves round the reference's and the prior's ellipses per recorded draw.
-REFERENCE_MOVES, PRIOR_MOVES = 15, 1
+REFERENCE_MOVES, PRIOR_MOVES = 30, 2
 # Draws that one call of the compiled sampler makes; its length is part of what is compiled.
-CHUNK = 50
+CHUNK = 25
 
 
 def sample_posterior(
@@ -44,9 +44,9 @@ def sample_posterior(
     indifferent: np.ndarray | None = None,
     tie_threshold: float | None = None,
     number_of_preferences: int | None = None,
-    num_warmup: int = 50,
-    num_samples: int = 500,
-    max_samples: int = 16_000,
+    num_warmup: int = 25,
+    num_samples: int = 250,
+    max_samples: int = 8_000,
     num_chains: int = 4,
     seed: int = 0,
 ) -> xr.DataTree:
@@ -66,7 +66,7 @@ def sample_posterior(
         does not matter.
       tie_threshold: δ > 0: margins within it are often called ties. None: no ties, and no threshold.
       number_of_preferences: K of eq. 8, where it is not the number of rows (an answer held out).
-      num_warmup: draws a chain that are thrown away; rounded up to whole chunks of min(num_samples, 50) draws.
+      num_warmup: draws a chain that are thrown away; rounded up to whole chunks of min(num_samples, 25) draws.
       num_samples: draws a chain to begin with, >= 4.
       max_samples: cap on the draws a chain.
       num_chains: >= 2, so that R̂ means something.

@@ -74,6 +74,7 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
 
     The reference differs from the prior by one Gaussian factor an answer, so that their ratio needs the margins alone:
     log N(z; 0, σ²I) − log N(z; m, AAᵀ) = ½ Σ s_k (L(z − m))_k² − mᵀ(z − m)/σ² + a constant.
+    Rows that are not used have a margin of zero everywhere, so that they are constants too.
     """
     loadings, centre = problem.loadings, problem.centre
     number = len(loadings)
@@ -86,7 +87,7 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
 
     def residual(v):
         margins, tilt = v[:, :number], v[:, number]
-        log_likelihood = total_log_prob(problem.likelihood, margins_at_centre + margins, problem.used)
+        log_likelihood = total_log_prob(problem.likelihood, margins_at_centre + margins)
         return log_likelihood + 0.5 * jnp.sum(problem.site_precisions * margins**2, axis=-1) - tilt
 
     def noise(key, moves):
@@ -103,7 +104,7 @@ def prior_ellipse(problem: PreferenceProblem) -> Ellipse:
     return Ellipse(
         lambda z: jnp.concatenate([problem.loadings @ z, z]),
         lambda key, moves: random.normal(key, (moves, rank), dtype=problem.loadings.dtype) @ map_noise.T,
-        lambda v: total_log_prob(problem.likelihood, v[:, :number], problem.used),
+        lambda v: total_log_prob(problem.likelihood, v[:, :number]),
         lambda v: v[number:],
     )
 
