@@ -78,7 +78,6 @@ def held_out_probabilities(
     if indifferent is not None and options.get("tie_threshold") is not None:
         options["indifferent"] = indifferent[used]
     tree = models.sample_posterior(known, **options)
-    tree.attrs["number_of_preferences"] = options["number_of_preferences"]
     return answer_probabilities(tree, differences[asked]), bool(tree.attrs["converged"])
 
 
@@ -90,9 +89,7 @@ def refit(tree: xr.DataTree, used: np.ndarray, **sampling_options: Any) -> xr.Da
     options = {"seed": int(tree.attrs["seed"]), **model_options(tree), **sampling_options}
     if options["tie_threshold"] is not None:
         options["indifferent"] = tied_rows(tree)[used]
-    others = models.sample_posterior(np.asarray(tree["constant_data"]["differences"])[used], **options)
-    others.attrs["number_of_preferences"] = options["number_of_preferences"]
-    return others
+    return models.sample_posterior(np.asarray(tree["constant_data"]["differences"])[used], **options)
 
 
 def model_options(tree: xr.DataTree) -> dict[str, Any]:
@@ -102,7 +99,7 @@ def model_options(tree: xr.DataTree) -> dict[str, Any]:
     return {
         **options,
         "tie_threshold": None if np.isnan(threshold) else threshold,
-        "number_of_preferences": int(
+        "number_of_preferences": int(  # trees of the first releases had no such attribute
             tree.attrs.get("number_of_preferences", tree["constant_data"].sizes["preference"])
         ),
     }

@@ -82,7 +82,8 @@ def sample_posterior(
       at the root: utility_weights_mean (feature), whose part outside the differences' row space is exactly zero;
         utility_weights_most_likely (feature), the draw of highest likelihood with the rest at its mean, zero; and the
         attributes log_evidence (expectation propagation's), log_evidence_converged, rhat_max,
-        effective_sample_size_min, converged, stuck, prior_scale, steepness, lapse_rate, likelihood, seed.
+        effective_sample_size_min, converged, stuck, prior_scale, steepness, lapse_rate, likelihood,
+        number_of_preferences, tie_threshold, seed.
       `stored(tree).to_netcdf(path)` writes it without the utility weights; `restored` brings them back.
 
     Raises:
@@ -98,6 +99,7 @@ def sample_posterior(
     ):
         if not isinstance(value, int | np.integer) or value < least:
             raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")
+    number_of_preferences = len(differences) if number_of_preferences is None else number_of_preferences
     fit = fit_gaussian(
         differences,
         prior_scale=prior_scale,
@@ -105,7 +107,7 @@ def sample_posterior(
             preference_likelihood(
                 likelihood,
                 steepness=steepness,
-                number_of_preferences=len(differences) if number_of_preferences is None else number_of_preferences,
+                number_of_preferences=number_of_preferences,
                 lapse_rate=lapse_rate,
             ),
             len(differences),
@@ -118,6 +120,7 @@ def sample_posterior(
         "steepness": float(steepness),
         "lapse_rate": float(lapse_rate),
         "likelihood": likelihood,
+        "number_of_preferences": int(number_of_preferences),
         "tie_threshold": float("nan") if tie_threshold is None else float(tie_threshold),
         "seed": int(seed),
     }
