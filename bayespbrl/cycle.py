@@ -262,7 +262,9 @@ class Learner:
         settings, state = self.settings, self.state
         pairs = state.preferences.pairs
         features = self._state_features(
-            self._rng(FEATURES, 2 * state.iteration), bandwidth_factor=settings.utility_bandwidth_factor
+            self._rng(FEATURES, 2 * state.iteration),
+            bandwidth_factor=settings.utility_bandwidth_factor,
+            normalised=settings.normalised_utility,
         )
         model: dict[str, Any] = {name: getattr(settings, name) for name in ("steepness", "lapse_rate")}
         fixed: dict[str, Any] = {name: getattr(settings, name) for name in ("discount", "prior_scale", "likelihood")}
@@ -339,7 +341,9 @@ class Learner:
         trajectories = self.state.trajectories if recent is None else self.state.trajectories[-recent * size :]
         return np.concatenate([trajectory.states[:-1] for trajectory in trajectories])
 
-    def _state_features(self, rng: np.random.Generator, *, bandwidth_factor: float) -> utility.StateFeatures:
+    def _state_features(
+        self, rng: np.random.Generator, *, bandwidth_factor: float, normalised: bool = False
+    ) -> utility.StateFeatures:
         """φ(s): the user's, or drawn anew at states observed so far."""
         if self.features is not None:
             features = self.features
@@ -352,6 +356,7 @@ class Learner:
             number_of_centres=self.settings.centres,
             bandwidth_factor=bandwidth_factor,
             period=self._period,
+            normalised=normalised,
         )
 
     @property

@@ -51,16 +51,19 @@ class RadialBasis:
       centres: shape (D, S).
       bandwidths: b > 0 in the units of the observation, shape (S,); a dimension of bandwidth zero is left out.
       period: shape (S,), infinite where not periodic.
+      normalised: whether φ is divided by its sum. A linear function of it then goes on beyond the centres with the
+        value of the nearest ones, where plain radial basis functions fall to zero.
     """
 
     centres: np.ndarray
     bandwidths: np.ndarray
     period: np.ndarray
+    normalised: bool = False
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Features of observations of shape (N, S); shape (N, D)."""
         observations = _vectors("observations", observations, self.centres.shape[1])
-        return radial_basis(observations, self.centres, self.bandwidths, self.period)
+        return radial_basis(observations, self.centres, self.bandwidths, self.period, normalised=self.normalised)
 
     def rescaled(self, multiples: ArrayLike) -> Self:
         """The same centres with bandwidths `multiples` times as wide, one number or one a dimension."""
@@ -126,6 +129,7 @@ def draw_state_features(
     number_of_centres: int,
     bandwidth_factor: float = 1.0,
     period: ArrayLike | None = None,
+    normalised: bool = False,
 ) -> OneHot | RadialBasis:
     """φ(s) for a space: one-hot where it is `Discrete`, else radial basis functions at observed states.
 
@@ -134,13 +138,14 @@ def draw_state_features(
       number_of_centres: D, drawn without replacement; at most N are.
       bandwidth_factor: multiple of the median rule.
       period: of each dimension, infinite where not periodic; None for none.
+      normalised: as of `RadialBasis`.
     """
     if isinstance(observation_space, Discrete):
         return OneHot(int(observation_space.n))
     states = _vectors("states", states, _box("observation_space", observation_space).shape[0])
     centres = states[_without_replacement(len(states), number_of_centres, rng)]
     bandwidths = median_bandwidths(states, factor=bandwidth_factor, period=period, rng=rng)
-    return RadialBasis(centres, bandwidths, as_periods(period, states.shape[1]))
+    return RadialBasis(centres, bandwidths, as_periods(period, states.shape[1]), normalised)
 
 
 def draw_state_action_features(

@@ -39,8 +39,8 @@ def inverse_bandwidths(bandwidths: np.ndarray, period: np.ndarray) -> np.ndarray
     return np.concatenate([inverse[~periodic], inverse[periodic], inverse[periodic]])
 
 
-def squared_exponential(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """exp(−½‖xᵢ − zⱼ‖²) of scaled coordinates (N, E) and (D, E); shape (N, D)."""
+def squared_exponential(points: np.ndarray, centres: np.ndarray, *, normalised: bool = False) -> np.ndarray:
+    """exp(−½‖xᵢ − zⱼ‖²) of scaled coordinates (N, E) and (D, E), or that over its sum over j; shape (N, D)."""
     middle = centres.mean(axis=0)  # the expansion of the square cancels; near the origin it loses least
     points, centres = points - middle, centres - middle
     left = np.column_stack([points, -0.5 * np.square(points).sum(axis=1), np.ones(len(points))])
@@ -49,15 +49,26 @@ def squared_exponential(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
     for start in range(0, len(points), ROWS_AT_A_TIME):
         block = kernel[start : start + ROWS_AT_A_TIME]
         np.matmul(left[start : start + ROWS_AT_A_TIME], right, out=block)
+        if normalised:  # the nearest centre's is exp(0), so that the sum is never zero, however far the point
+            block -= block.max(axis=1, keepdims=True)
         np.minimum(block, 0.0, out=block)
         np.exp(block, out=block)
+        if normalised:
+            block /= block.sum(axis=1, keepdims=True)
     return kernel
 
 
-def radial_basis(points: np.ndarray, centres: np.ndarray, bandwidths: np.ndarray, period: np.ndarray) -> np.ndarray:
-    """k(xᵢ, zⱼ) for points (N, S) and centres (D, S), with bandwidths and period of shape (S,); shape (N, D)."""
+def radial_basis(
+    points: np.ndarray, centres: np.ndarray, bandwidths: np.ndarray, period: np.ndarray, *, normalised: bool = False
+) -> np.ndarray:
+    """k(xᵢ, zⱼ) for points (N, S) and centres (D, S), with bandwidths and period of shape (S,); shape (N, D).
+
+    With `normalised` each row is divided by its sum.
+    """
     scale = inverse_bandwidths(bandwidths, period)
-    return squared_exponential(coordinates(points, period) * scale, coordinates(centres, period) * scale)
+    return squared_exponential(
+        coordinates(points, period) * scale, coordinates(centres, period) * scale, normalised=normalised
+    )
 
 
 def radial_basis_row(

@@ -33,6 +33,9 @@ class Settings:
       hyperparameters: whether the utility's length scales, the steepness and the lapse rate are chosen each iteration
         by the `evidence` of the answers, beginning at the given ones, or are the `given` ones.
       utility_bandwidth_factor: multiplies the median rule for the utility's features.
+      normalised_utility: whether the utility's radial basis functions are divided by their sum. Decision: they are, so
+        that "upright is good" goes on to upright states that no compared trajectory was in, where the plain functions
+        of the paper fall to zero and hold the policy to what it knows.
       seed: of every random choice of the run.
       query: which of the new trajectories are asked about; `highest-utility` is the paper's rule, the others look at
         the posterior.
@@ -65,6 +68,7 @@ class Settings:
     lapse_rate: float = 0.0
     hyperparameters: str = "evidence"
     utility_bandwidth_factor: float = 1.0
+    normalised_utility: bool = True
     seed: int = 0
     query: str = "highest-utility"
     trajectories_per_iteration: int = 10
@@ -113,6 +117,8 @@ class Settings:
             _number(name, getattr(self, name), lambda value: 0 <= value < 1, "a number in [0, 1)")
         for name in ("iterations", "queries_per_iteration", "first_queries", "evaluation_episodes", "centres"):
             _whole(name, getattr(self, name), 1)
+        if not isinstance(self.normalised_utility, bool):
+            raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")
         _whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
         _whole("seed", self.seed, 0)
         for name in ("max_steps", "recent_iterations"):

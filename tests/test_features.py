@@ -1,7 +1,7 @@
 """Features: one-hot, radial basis functions, their products with actions, and the checks of a user's own."""
 
 import time
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import jax
 import numpy as np
@@ -70,6 +70,19 @@ def test_matrix_product_loses_no_accuracy_far_from_the_origin():
     bandwidths = np.array([0.5, 1.0, 2.0])
     direct = np.exp(-0.5 * (np.square(points[:, None] - centres) / bandwidths**2).sum(axis=2))
     np.testing.assert_allclose(RadialBasis(centres, bandwidths, np.full(3, np.inf))(points), direct, rtol=1e-12)
+
+
+def test_normalised_functions_are_the_plain_ones_over_their_sum_and_go_on_beyond_the_centres():
+    rng = np.random.default_rng(0)
+    plain = RadialBasis(rng.normal(size=(7, 2)), np.array([0.5, 2.0]), np.array([np.inf, 3.0]))
+    normalised = replace(plain, normalised=True)
+    points = rng.normal(size=(2500, 2))
+    np.testing.assert_allclose(normalised(points), plain(points) / plain(points).sum(axis=1, keepdims=True), rtol=1e-9)
+    far = np.array([[1e3, 0.0], [-1e3, 0.0]])
+    assert np.all(plain(far) == 0)
+    expected = np.eye(7)[[np.argmax(plain.centres[:, 0]), np.argmin(plain.centres[:, 0])]]
+    np.testing.assert_allclose(normalised(far), expected, atol=1e-12)
+    assert normalised.rescaled(2.0).normalised
 
 
 def test_the_traceable_row_equals_the_matrix():

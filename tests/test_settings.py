@@ -38,6 +38,7 @@ BAD = {
     "schedule": ["bold", None],
     "hyperparameters": ["chosen", None],
     "utility_bandwidth_factor": [0, -1.0, NAN],
+    "normalised_utility": [None, 1, "yes"],
 }
 
 

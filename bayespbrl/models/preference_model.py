@@ -145,7 +145,7 @@ def padded_problem(
 
 
 def _capacity(number: int) -> int:
-    """A power of two, at least 8; above 64, where padding costs more than the compilation it saves, in quarter steps."""
+    """A power of two, at least 8; above 64, where padding costs more than a compilation, in quarter steps."""
     power = max(8, 1 << (max(number, 1) - 1).bit_length())
     step = power // 8
     return power if power <= 64 else -(-number // step) * step
