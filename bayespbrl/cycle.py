@@ -21,8 +21,8 @@ from bayespbrl.trajectories import Trajectory, Transitions, transitions
 COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE = range(7)
 # Posterior draws that a rule for questions looks at: enough to order ten candidates, in hundredths of a second.
 QUERY_DRAWS = 500
-# And a schedule: a share of them is known within 0.04, which is less than it moves between bounds.
-SCHEDULE_DRAWS = 200
+# And a schedule, for which every draw costs a column of LSTD: the spread of a gain is known within a tenth of itself.
+SCHEDULE_DRAWS = 100
 
 
 class Learner:
@@ -289,6 +289,7 @@ class Learner:
         settings, iteration = self.settings, self.state.iteration
         rng = self._rng(FEATURES, 2 * iteration + 1)
         state_action_features = self.state_action_features(steps, rng=rng)
+        utilities, utility_draws = self._step_utilities(estimate, steps)
         bounds: list[schedules.Bound] = []
 
         def decide(update: improvement.ProposedUpdate) -> float:
@@ -301,7 +302,7 @@ class Learner:
         improved = improvement.improve(
             self.state.policy,
             steps,
-            estimate.step_utilities(steps),
+            utilities,
             key=self._key(IMPROVE, iteration),
             rng=self._rng(IMPROVE, iteration),
             action_space=self.environment.action_space,
@@ -312,7 +313,7 @@ class Learner:
             fixed_point_ridge=settings.fixed_point_ridge,
             projection_ridge=settings.projection_ridge,
             visited=self._recent_states(),
-            utility_draws=self._utility_draws(estimate, steps),
+            utility_draws=utility_draws,
         )
         return improved, bounds[-1]
 
@@ -329,11 +330,13 @@ class Learner:
             period=self._period,
         )
 
-    def _utility_draws(self, estimate: Any, steps: Any) -> np.ndarray | None:
-        """Utilities of each step under some posterior draws, (N, S); None where no schedule asks or none are there."""
+    def _step_utilities(self, estimate: Any, steps: Transitions) -> tuple[np.ndarray, np.ndarray | None]:
+        """uᵢ of each step, (N,), and under posterior draws, (N, S); None where no schedule asks or there are none."""
         if isinstance(self.schedule, schedules.ConstantBound) or getattr(estimate, "posterior", None) is None:
-            return None
-        return estimate.draws(estimate.features(steps.next_states), number=SCHEDULE_DRAWS).reshape(-1, len(steps)).T
+            return estimate.step_utilities(steps), None
+        features = estimate.features(steps.next_states)
+        draws = estimate.draws(features, number=SCHEDULE_DRAWS).reshape(-1, len(steps)).T
+        return features @ estimate.weights, draws
 
     def _recent_states(self) -> np.ndarray:
         """The states in which the last iterations acted: those of the policy update."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from bayespbrl.improvement import ProposedUpdate
 
-BOUNDS = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
+LEAST_BOUND = 0.02  # nats; an update of nothing would leave the draws nothing to disagree about
 
 
 @dataclass(frozen=True)
@@ -68,48 +68,43 @@ class ConstantBound:
 
 @dataclass(frozen=True)
 class ConfidenceBound:
-    """The largest bound at which nine posterior draws in ten still find the new policy better than the old.
+    """As large a share of the largest bound as the posterior is sure of the gain that the update promises.
 
-    Each draw of the utility has a Q-function of its own (LSTD is linear in the utility), and REPS's weights p(ε) for
-    the mean Q promise it a gain of Σ (pᵢ − Wᵢ)Qᵢ. The *agreement* at ε is the share of the draws whose gain is
-    positive: it asks whether the update is safe, not whether the trajectories are easy to order. A posterior that has
-    not converged, or none at all, never raises the bound over the run's own.
+    Each draw of the utility has a Q-function of its own (LSTD is linear in the utility), and REPS's weights p for the
+    mean Q promise it a gain of G = Σ (pᵢ − Wᵢ)Qᵢ. An update of relative length s gains about s·G and a draw regrets
+    what it loses, so that of all s in [0, 1] the one that maximises E[sG] − ½E[(sG)²]/E[G] is the *signal*
+    s = E[G]²/(E[G]² + Var[G]). KL grows with the square of the length: the bound is s² times the largest. It asks
+    whether this update is safe, not whether the trajectories are easy to order. Where the mean expects no gain, or for
+    a posterior that has not converged, the bound is never raised over the run's own.
 
     Attributes:
-      bounds: to choose from, nats, > 0.
-      confidence: the agreement that is asked for, in (0, 1].
+      largest: the bound when all draws expect the same gain, nats, > 0.
     """
 
-    bounds: tuple[float, ...] = BOUNDS
-    confidence: float = 0.9
+    largest: float = 1.0
 
     def __post_init__(self) -> None:
-        if not self.bounds or not all(np.isfinite(bound) and bound > 0 for bound in self.bounds):
-            raise ValueError(f"bounds: expected finite numbers > 0, got {self.bounds}")
-        if not 0 < self.confidence <= 1:
-            raise ValueError(f"confidence: expected a share in (0, 1], got {self.confidence}")
+        if not (np.isfinite(self.largest) and self.largest > 0):
+            raise ValueError(f"largest: expected a finite number > 0, got {self.largest}")
 
     def __call__(self, situation: Situation) -> Bound:
-        quality, update = situation.estimate.quality, situation.update
-        diagnostics = {
+        quality, update, usual = situation.estimate.quality, situation.update, situation.usual_bound
+        statistics = {
             "rhat_max": float(quality.rhat_max),
             "effective_sample_size_min": float(quality.effective_sample_size_min),
         }
         if update.q_draws is None:
-            return Bound(situation.usual_bound, "no posterior: the run's own bound", diagnostics)
-        allowed = sorted(self.bounds)
-        if not quality.converged:
-            allowed = [bound for bound in allowed if bound <= situation.usual_bound] or [allowed[0]]
-        for bound in reversed(allowed):
-            agreement = update.agreement(bound)
-            if agreement >= self.confidence:
-                break
-        reason = f"{agreement:.0%} of the draws find an update of {bound:g} nats better"
-        if agreement < self.confidence:
-            reason += f", fewer than {self.confidence:.0%}: the least bound"
-        if not quality.converged:
-            reason += "; not converged: no more than the run's own bound"
-        return Bound(bound, reason, {"agreement": agreement, **diagnostics})
+            return Bound(usual, "no posterior: the run's own bound", statistics)
+        gains = update.gains(usual)
+        square = float(np.mean(gains)) ** 2
+        total = square + float(np.var(gains))
+        signal = square / total if total > 0 and np.mean(gains) > 0 else 0.0
+        statistics |= {"signal": signal, "agreement": update.agreement(usual)}
+        bound = max(LEAST_BOUND, signal**2 * self.largest)
+        reason = f"{statistics['agreement']:.0%} of the draws expect a gain, whose signal is {signal:.2f}"
+        if not quality.converged and bound > usual:
+            return Bound(usual, f"{reason}; not converged: no more than the run's own bound", statistics)
+        return Bound(bound, reason, statistics)
 
 
 SCHEDULES: dict[str, Schedule] = {"constant": ConstantBound(), "confidence": ConfidenceBound()}

@@ -8,7 +8,7 @@ import pytest
 from bayespbrl import Learner, load, resume, start
 from bayespbrl.experts import ReturnExpert
 from bayespbrl.improvement import ProposedUpdate
-from bayespbrl.schedules import BOUNDS, Bound, ConfidenceBound, ConstantBound, Situation, decided
+from bayespbrl.schedules import LEAST_BOUND, Bound, ConfidenceBound, ConstantBound, Situation, decided
 
 NUMBER = 400
 
@@ -41,30 +41,39 @@ def test_the_gain_of_the_mean_itself_is_what_reps_promises_and_grows_with_the_bo
 def test_certain_draws_allow_the_largest_bound_and_draws_at_odds_the_least():
     mean = proposed().q_values
     sure = ConfidenceBound()(situation(proposed(np.column_stack([mean] * 10))))
-    assert (sure.kl_bound, sure.statistics["agreement"]) == (max(BOUNDS), 1.0)
+    assert sure.kl_bound == pytest.approx(1.0)
+    assert (sure.statistics["signal"], sure.statistics["agreement"]) == (pytest.approx(1.0), 1.0)
+    assert ConfidenceBound(2.0)(situation(proposed(np.column_stack([mean] * 10)))).kl_bound == pytest.approx(2.0)
     at_odds = ConfidenceBound()(situation(proposed(np.column_stack([mean, -mean]))))
-    assert (at_odds.kl_bound, at_odds.statistics["agreement"]) == (min(BOUNDS), 0.5)
-    assert "fewer than 90%" in at_odds.reason
+    assert (at_odds.kl_bound, at_odds.statistics["agreement"]) == (LEAST_BOUND, 0.5)
+    assert "50% of the draws expect a gain" in at_odds.reason
     assert sure.statistics["rhat_max"] == 1.002
+    worse = ConfidenceBound()(situation(proposed(np.column_stack([-mean] * 10))))
+    assert (worse.kl_bound, worse.statistics["signal"]) == (LEAST_BOUND, 0.0)
+    nothing = ConfidenceBound()(situation(proposed(np.zeros((NUMBER, 4)))))
+    assert nothing.kl_bound == LEAST_BOUND
 
 
-def test_the_bound_is_the_largest_at_which_the_draws_agree():
-    """A draw that likes what the mean likes, but for the very best tenth: small updates please it, bold ones do not."""
+def test_the_bound_is_the_square_of_the_length_that_weighs_gain_against_spread():
     mean = proposed().q_values
-    draw = np.where(mean > np.quantile(mean, 0.97), -20.0, mean)
-    update = proposed(np.column_stack([draw] * 10))
-    bound = ConfidenceBound(bounds=(0.001, 0.01, 0.1, 1.0, 2.0))(situation(update))
-    agreements = [update.agreement(value) for value in (0.001, 0.01, 0.1, 1.0, 2.0)]
-    assert agreements[-1] == 0.0
-    largest = max((v for v, a in zip((0.001, 0.01, 0.1, 1.0, 2.0), agreements, strict=True) if a >= 0.9), default=0.001)
-    assert bound.kl_bound == largest
+    draws = np.column_stack([factor * mean for factor in (0.5, 1.0, 3.0, -1.0)])
+    bound = ConfidenceBound(largest=0.8)(situation(proposed(draws)))
+    gains = np.array([0.5, 1.0, 3.0, -1.0])
+    lengths = np.linspace(0, 1, 100_001)
+    worth = lengths * gains.mean() - 0.5 * lengths**2 * np.mean(gains**2) / gains.mean()
+    assert bound.statistics["signal"] == pytest.approx(lengths[np.argmax(worth)], abs=1e-5)
+    assert bound.kl_bound == pytest.approx(0.8 * bound.statistics["signal"] ** 2)
+    assert bound.statistics["agreement"] == 0.75
 
 
 def test_a_posterior_that_has_not_converged_never_raises_the_bound():
     mean = proposed().q_values
     update = proposed(np.column_stack([mean] * 10))
     assert ConfidenceBound()(situation(update, converged=False)).kl_bound == 0.35
-    assert ConfidenceBound()(situation(update, converged=False, usual=0.05)).kl_bound == 0.1
+    assert ConfidenceBound()(situation(update, converged=False, usual=0.05)).kl_bound == 0.05
+    assert "not converged" in ConfidenceBound()(situation(update, converged=False)).reason
+    at_odds = proposed(np.column_stack([mean, -0.5 * mean]))
+    assert ConfidenceBound()(situation(at_odds, converged=False)).kl_bound < 0.05
     assert ConfidenceBound()(situation(proposed(), usual=0.27)).kl_bound == 0.27  # no posterior
 
 
@@ -82,10 +91,10 @@ def test_a_schedule_that_decides_nonsense_is_named(value):
         decided(careless, situation(proposed()))
 
 
-@pytest.mark.parametrize("options", [{"bounds": ()}, {"bounds": (0.1, -1.0)}, {"confidence": 0.0}, {"confidence": 1.2}])
-def test_bad_options_are_refused(options):
-    with pytest.raises(ValueError, match=f"{next(iter(options))}: expected"):
-        ConfidenceBound(**options)
+@pytest.mark.parametrize("largest", [0.0, -1.0, float("nan"), float("inf")])
+def test_bad_options_are_refused(largest):
+    with pytest.raises(ValueError, match="largest: expected"):
+        ConfidenceBound(largest)
 
 
 def three_lines(situation):
@@ -108,7 +117,8 @@ def test_a_run_follows_a_schedule_of_the_users_own_records_why_and_goes_on_with_
 def test_the_bound_follows_the_posterior_of_a_run_and_comes_from_the_same_choices():
     learner = Learner("gridworld", schedule="confidence", iterations=3, evaluation_episodes=5).run(ReturnExpert())
     for summary in learner.iterations:
-        assert summary["kl_bound"] in BOUNDS
+        assert LEAST_BOUND <= summary["kl_bound"] <= 1
+        assert 0 <= summary["schedule"]["signal"] <= 1
         assert 0 <= summary["schedule"]["agreement"] <= 1
         assert summary["schedule"]["rhat_max"] == summary["rhat_max"]
 
