@@ -184,6 +184,7 @@ class Learner:
             key=self._key(COLLECT, state.iteration),
             episodes=settings.trajectories_per_iteration,
             max_steps=settings.max_steps,
+            hold=settings.exploration_hold,
         )
         numbers = range(len(state.trajectories), len(state.trajectories) + len(collected))
         if state.estimate is None:

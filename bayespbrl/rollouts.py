@@ -25,6 +25,8 @@ from bayespbrl.envs.opening import environment_name, open_environment
 from bayespbrl.envs.stepping import episodes_by_interface
 from bayespbrl.trajectories import Trajectory
 
+_PHASE = 2**31 - 1  # no step of an episode has this number
+
 __all__ = ["Returns", "compilations", "open_environment", "returns", "rollout", "step_limit"]
 
 
@@ -44,7 +46,7 @@ class Returns:
 
 
 def rollout(
-    environment: Any, policy: Any, *, key: jax.Array, episodes: int, max_steps: int | None = None
+    environment: Any, policy: Any, *, key: jax.Array, episodes: int, max_steps: int | None = None, hold: int = 1
 ) -> tuple[Trajectory, ...]:
     """Trajectories of `episodes` episodes under `policy.sample`.
 
@@ -54,17 +56,21 @@ def rollout(
       key: JAX random key; it decides everything, resets included.
       episodes: number of episodes, ≥ 1.
       max_steps: time limit; by default the environment's own.
+      hold: steps for which the policy's random key stays the same, ≥ 1. Each action still follows the policy's law at
+        its state; its chance is that of its neighbours in time, and reaches further than chances that average out.
 
     Raises:
       ValueError: bad arguments; no time limit known; an environment that raises or returns NaN, named with the step.
     """
     env = open_environment(environment)
     steps = _checked(env, policy, key, episodes, max_steps)
+    if isinstance(hold, bool) or not isinstance(hold, int | np.integer) or hold < 1:
+        raise ValueError(f"hold: expected an integer ≥ 1, got {hold!r}")
     dynamics = _pure_dynamics(env, policy)
     if dynamics is None:
-        return tuple(_by_interface(env, policy, key, episodes, steps, max_steps is not None))
+        return tuple(_by_interface(env, policy, key, episodes, steps, max_steps is not None, hold))
     with jax.enable_x64(True):
-        run = _simulate(dynamics, policy, key, episodes=episodes, steps=steps)
+        run = _simulate(dynamics, policy, key, hold, episodes=episodes, steps=steps)
         observations, actions, rewards, terminated, lengths = (np.asarray(part) for part in run)
     if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
         raise ValueError(_not_finite(env, _first_not_finite(observations, rewards)))
@@ -168,10 +174,17 @@ def _start(dynamics: FuncEnv, key: jax.Array) -> tuple[tuple[Any, Any, Any], jax
     return (state, _wide(dynamics, observation), jnp.asarray(True)), steps_key
 
 
-def _advance(dynamics: FuncEnv, policy: Any, running: tuple[Any, Any, Any], steps_key: jax.Array, t: Any) -> Any:
+def _advance(
+    dynamics: FuncEnv, policy: Any, running: tuple[Any, Any, Any], steps_key: jax.Array, t: Any, hold: Any = 1
+) -> Any:
     """One step of one episode; an episode that has ended stays as it is and earns nothing."""
     state, observation, alive = running
-    action_key, transition_key = jax.random.split(jax.random.fold_in(steps_key, t))
+    phase = jax.random.randint(jax.random.fold_in(steps_key, _PHASE), (), 0, hold)
+    drawn = jnp.maximum(
+        (t + phase) // hold * hold - phase, 0
+    )  # when the action's chance was, or would have been, drawn
+    action_key, _ = jax.random.split(jax.random.fold_in(steps_key, drawn))
+    _, transition_key = jax.random.split(jax.random.fold_in(steps_key, t))
     action = _clipped(dynamics.action_space, policy.sample(action_key, observation))
     next_state, next_observation, reward, terminated = functional.step(dynamics, transition_key, state, action)
 
@@ -186,13 +199,13 @@ def _advance(dynamics: FuncEnv, policy: Any, running: tuple[Any, Any, Any], step
 
 
 @partial(jax.jit, static_argnames=("dynamics", "episodes", "steps"))
-def _simulate(dynamics: FuncEnv, policy: Any, key: jax.Array, *, episodes: int, steps: int) -> Any:
+def _simulate(dynamics: FuncEnv, policy: Any, key: jax.Array, hold: Any, *, episodes: int, steps: int) -> Any:
     def episode(key: jax.Array) -> Any:
         running, steps_key = _start(dynamics, key)
         first = running[1]
 
         def scan_step(running: Any, t: Any) -> Any:
-            running, outcome = _advance(dynamics, policy, running, steps_key, t)
+            running, outcome = _advance(dynamics, policy, running, steps_key, t, hold)
             return running, (running[1], *outcome)
 
         _, (observations, actions, rewards, terminated, alive) = jax.lax.scan(scan_step, running, jnp.arange(steps))
@@ -248,7 +261,7 @@ def _act_one_by_one(policy: Any, key: jax.Array, counter: int, observations: np.
 
 
 def _by_interface(
-    env: gymnasium.Env, policy: Any, key: jax.Array, episodes: int, steps: int, explicit: bool
+    env: gymnasium.Env, policy: Any, key: jax.Array, episodes: int, steps: int, explicit: bool, hold: int = 1
 ) -> Iterator[Trajectory]:
     seed_key, policy_key = jax.random.split(key)
     seed = int(jax.random.randint(seed_key, (), 0, 2**30))
@@ -256,7 +269,7 @@ def _by_interface(
 
     def act(counter: int, observations: np.ndarray) -> np.ndarray:
         with jax.enable_x64(True):
-            actions = np.asarray(choose(policy, policy_key, counter, observations))
+            actions = np.asarray(choose(policy, policy_key, counter // hold, observations))
         if not np.isfinite(actions).all():
             raise ValueError(f"policy {type(policy).__name__}: expected finite actions, got NaN or infinity")
         return actions

@@ -51,6 +51,9 @@ class Settings:
       bandwidth_factor: multiplies the median rule for the features of Q and V.
       recent_iterations: the policy update takes the states of so many last iterations; None for those of all. LSTD
         always has all transitions.
+      exploration_hold: steps for which the random choice of the exploring policy is held; 1 is the paper's. Noise that is
+        drawn afresh at each step averages out and leaves the ten trajectories of an iteration alike. The evaluation of
+        a policy never holds it.
       initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
       fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂.
       expert, wrong_answers: who answers, and the share of a simulated expert's answers that are turned round; kept so
@@ -82,6 +85,7 @@ class Settings:
     centres: int = 300
     bandwidth_factor: float = 1.0
     recent_iterations: int | None = None
+    exploration_hold: int = 1
     initial_action_scale: float = 0.75
     fixed_point_ridge: float = 1e-8
     projection_ridge: float = 1e-8
@@ -120,6 +124,7 @@ class Settings:
         if not isinstance(self.normalised_utility, bool):
             raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")
         _whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
+        _whole("exploration_hold", self.exploration_hold, 1)
         _whole("seed", self.seed, 0)
         for name in ("max_steps", "recent_iterations"):
             if getattr(self, name) is not None:

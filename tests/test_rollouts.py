@@ -131,6 +131,40 @@ def test_stored_actions_are_clipped_to_the_action_space():
     assert np.abs(actions).max(axis=0).tolist() == [2.0, 0.02]
 
 
+def changes(trajectories):
+    """Steps at which the first action differs from the one before, by trajectory."""
+    return [np.flatnonzero(np.diff(t.actions[:, 0]) != 0) + 1 for t in trajectories]
+
+
+def test_chance_is_held_for_so_many_steps_from_a_phase_of_each_episode_and_keeps_its_law():
+    policy = Gaussian(np.zeros(1), np.array([5.0]))
+    before = rollouts.compilations()
+    held = rollout("swing-up", policy, key=KEY, episodes=200, hold=5)
+    for at in changes(held):
+        assert np.all(np.diff(at) == 5)
+    assert {int(at[0]) for at in changes(held)} == {1, 2, 3, 4, 5}
+    values = np.concatenate([t.actions[2::5, 0] for t in held])
+    assert abs(values.mean()) < 4 * 5 / np.sqrt(len(values))
+    assert values.std() == pytest.approx(5.0, rel=0.06)
+    assert len(changes(rollout("swing-up", policy, key=KEY, episodes=1))[0]) == 59
+    assert rollouts.compilations() <= before + 2  # one for each number of episodes, none for another hold
+
+
+def test_chance_is_held_through_the_interface_too():
+    mild = Gaussian(np.zeros(1), np.array([0.3]))
+    trajectories = rollout("bayespbrl-tests/Plain-v0", mild, key=KEY, episodes=3, hold=4)
+    for trajectory, at in zip(trajectories, changes(trajectories), strict=True):
+        assert len(trajectory) == 9
+        assert np.all(np.diff(at) == 4)
+        assert len(at) == 2
+
+
+@pytest.mark.parametrize("hold", [0, -1, True, 1.5, None])
+def test_a_hold_that_is_no_number_of_steps_is_refused(hold):
+    with pytest.raises(ValueError, match="hold: expected an integer"):
+        rollout("swing-up", STEER, key=KEY, episodes=1, hold=hold)
+
+
 def test_returns_are_those_of_the_same_rollout():
     trajectories = rollout("bicycle", WIDE, key=KEY, episodes=40)
     result = returns("bicycle", WIDE, key=KEY, episodes=40)

@@ -35,6 +35,7 @@ BAD = {
     "centres": [0, -300, 1.5],
     "max_steps": [0, -1, True, 10.0],
     "recent_iterations": [0, -4, True, 2.0],
+    "exploration_hold": [0, -1, True, 2.0, None],
     "schedule": ["bold", None],
     "hyperparameters": ["chosen", None],
     "utility_bandwidth_factor": [0, -1.0, NAN],
