@@ -51,9 +51,8 @@ class Settings:
       bandwidth_factor: multiplies the median rule for the features of Q and V.
       recent_iterations: the policy update takes the states of so many last iterations; None for those of all. LSTD
         always has all transitions.
-      exploration_hold: steps for which the random choice of the exploring policy is held; 1 is the paper's. Noise that is
-        drawn afresh at each step averages out and leaves the ten trajectories of an iteration alike. The evaluation of
-        a policy never holds it.
+      exploration_hold: steps for which the exploring policy's random choice is held; 1 is the paper's. Noise drawn afresh
+        at each step averages out and leaves the trajectories of an iteration alike. An evaluation never holds it.
       initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
       fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂.
       expert, wrong_answers: who answers, and the share of a simulated expert's answers that are turned round; kept so
@@ -170,7 +169,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # run. Posterior mean, last value: kl_bound 0.35, seeds 0-3: -963, -963, -996, -996; 0.5, seeds 0-2: -938, -967,
     # -967, but seed 1 only from answer 23 on (0.35: from 13). exploration_hold, a quarter of a second: posterior mean,
     # below -1300 after 21 answers: 3 of 20 without (seeds 100-119), 2 of 20 with it (seeds 120-139), median -970 and
-    # -955; with the query rule `information` 1 and, after 26 answers, 0.
+    # -955; with the query rule `information` 1 and, seeds 120-139, 26 answers, 1.
     "swing-up": {
         "iterations": 40,
         "kl_bound": 0.35,
