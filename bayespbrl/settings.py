@@ -51,8 +51,8 @@ class Settings:
       bandwidth_factor: multiplies the median rule for the features of Q and V.
       recent_iterations: the policy update takes the states of so many last iterations; None for those of all. LSTD
         always has all transitions.
-      exploration_hold: steps for which the exploring policy's random choice is held; 1 is the paper's. Noise drawn afresh
-        at each step averages out and leaves the trajectories of an iteration alike. An evaluation never holds it.
+      exploration_hold: steps for which the exploring policy's random choice is held; 1 is the paper's. Noise drawn
+        afresh at each step averages out and leaves the trajectories of an iteration alike. Evaluations never hold it.
       initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
       fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂.
       expert, wrong_answers: who answers, and the share of a simulated expert's answers that are turned round; kept so
