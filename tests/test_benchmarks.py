@@ -55,3 +55,19 @@ def test_the_seconds_of_the_steps_of_a_trial_add_up():
     assert result["answers"] == 3
     assert 100 < result["peak_memory_mib"] < 2048
     assert all(any(f"  {step} " in row for row in table) for step in steps)
+
+
+def test_studies_are_compared_seed_by_seed(tmp_path):
+    curves = {"first": {1: [0, 10, 20], 2: [0, 0, 4], 3: [0, 10, 12]}, "second": {3: [0, 20, 22], 1: [10, 20, 25]}}
+    for name, trials in curves.items():
+        rows = [f"{seed},{i + 1},{i + 2},{value}" for seed, values in trials.items() for i, value in enumerate(values)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["seed,iteration,answers,value", *rows]))
+    arguments = [str(tmp_path / f"{name}.csv") for name in curves]
+    options = ["--floor", "0", "--ceiling", str(tmp_path / "second.csv"), "--lost", "10"]
+    command = [sys.executable, str(BENCHMARKS / "compare.py"), *arguments, *options]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert lines[0] == "relative value 0.95: 22.32"  # 0.95 of the median of 22 and 25
+    first, second = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
+    assert first == ["first", "3", "12 [8]", "1", "never", "–"]
+    # seeds 3 and 1 differ by 10 and 5, in the second study's order as in any other
+    assert second == ["second", "2", "23.5 [22.75]", "0", "4", "+7.5 [+5.0, +10.0]"]

@@ -1,0 +1,91 @@
+"""Studies side by side, seed by seed: what their `trials.csv` say about learning.
+
+    python benchmarks/compare.py runs/a runs/b … [--floor -4680] [--ceiling runs/known-reward] [--lost -1300]
+
+The first study is the one that the others are compared with. For each: the median and lower quartile of the value at
+some numbers of answers and at the end; how many trials are lost, which is to end below `--lost`; the answers at which
+the lower quartile of the relative value (specification, section 1: (value − floor) / (ceiling − floor)) reaches 0.95;
+and the median difference to the first study over the same seeds, with a 95 % bootstrap interval. A study is a directory
+of `bayespbrl trials` or its table. The floor is the random policy's value; the ceiling a number, or a study with the
+known reward, whose median it is.
+"""
+
+import argparse
+import csv
+from pathlib import Path
+
+import numpy as np
+
+COLUMNS = (6, 8, 10, 15, 20, 30)
+REACHED = 0.95
+
+
+class Study:
+    """Values over (seed, iteration), and the answers at each iteration."""
+
+    def __init__(self, path: str):
+        table = Path(path)
+        table = table / "trials.csv" if table.is_dir() else table
+        self.name = table.parent.name if table.name == "trials.csv" else table.stem
+        rows: dict[int, dict[int, tuple[int, float]]] = {}
+        with table.open() as lines:
+            for row in csv.DictReader(lines):
+                seed = rows.setdefault(int(row["seed"]), {})
+                seed[int(row["iteration"])] = int(row["answers"]), float(row["value"])
+        self.seeds = sorted(rows)
+        kept = [[rows[seed][iteration] for iteration in sorted(rows[seed])] for seed in self.seeds]
+        self.answers = np.array([answers for answers, _ in kept[0]])
+        self.values = np.array([[value for _, value in trial] for trial in kept])
+
+    def at(self, answers: int) -> np.ndarray:
+        """The value of each trial once so many answers are in."""
+        return self.values[:, np.flatnonzero(self.answers <= answers)[-1]]
+
+    def answers_to(self, value: float, quantile: float) -> str:
+        """The first number of answers at which a quantile of the value is `value` or more."""
+        reached = np.flatnonzero(np.quantile(self.values, quantile, axis=0) >= value)
+        return str(self.answers[reached[0]]) if len(reached) else "never"
+
+
+def paired(study: Study, reference: Study) -> str:
+    """The median difference of the last value over the seeds of both, with its bootstrap interval."""
+    seeds = [seed for seed in study.seeds if seed in reference.seeds]
+    last, before = (np.array([one.values[one.seeds.index(seed), -1] for seed in seeds]) for one in (study, reference))
+    differences = last - before
+    chosen = np.random.default_rng(0).integers(len(seeds), size=(10_000, len(seeds)))
+    low, high = np.quantile(np.median(differences[chosen], axis=1), [0.025, 0.975])
+    return f"{np.median(differences):+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def main() -> None:
+    """Read the studies and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("studies", nargs="+")
+    parser.add_argument("--floor", type=float, help="value of the random policy")
+    parser.add_argument("--ceiling", help="value, or study, of the known reward")
+    parser.add_argument("--lost", type=float, help="a trial that ends below is lost")
+    options = parser.parse_args()
+    studies = [Study(path) for path in options.studies]
+    reached = None
+    if options.floor is not None and options.ceiling is not None:
+        try:
+            ceiling = float(options.ceiling)
+        except ValueError:
+            ceiling = float(np.median(Study(options.ceiling).values[:, -1]))
+        reached = options.floor + REACHED * (ceiling - options.floor)
+        print(f"relative value {REACHED}: {reached:.4g}")
+    columns = [answers for answers in COLUMNS if answers < studies[0].answers[-1]]
+    names = [f"after {answers}" for answers in columns] + ["at the end", "lost", "answers to 0.95", "paired difference"]
+    print("| study | trials | " + " | ".join(names) + " |")
+    print("|---|" + "---|" * (len(names) + 1))
+    for study in studies:
+        cells = [study.at(answers) for answers in columns] + [study.values[:, -1]]
+        row = [f"{np.median(cell):.4g} [{np.quantile(cell, 0.25):.4g}]" for cell in cells]
+        row.append("–" if options.lost is None else str(int(np.sum(study.values[:, -1] < options.lost))))
+        row.append("–" if reached is None else study.answers_to(reached, 0.25))
+        row.append("–" if study is studies[0] else paired(study, studies[0]))
+        print(f"| {study.name} | {len(study.seeds)} | " + " | ".join(row) + " |")
+
+
+if __name__ == "__main__":
+    main()
