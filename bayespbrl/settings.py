@@ -185,8 +185,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     # ridges 1e-8: -21 and -16 (0.15, 0.10); twice the rule -11, -10; three times and ridges 1e-5: -12, -6; then
     # kl_bound 0.6 and the last four iterations' states -8.0, -7.5 (0.03, 0.02). A linear-Gaussian policy: -25, -34.
     # Posterior mean, the same seeds, three times the rule and kl_bound 0.6: by evidence -26, -60 (four length scales
-    # are more than these answers can tell), given -12, -25, given at twice the rule -11, -23; twice the rule and kl_bound
-    # 0.3, given: -12, -14.
+    # are more than these answers can tell), given -12, -25, given at twice the rule -11, -23; with twice the rule for
+    # Q and V and kl_bound 0.3, given: -12, -14.
     "bicycle": {
         "iterations": 25,
         "kl_bound": 0.3,
