@@ -130,10 +130,9 @@ def elliptical_moves(
             return candidates[-1], low, high, found, tried + more, angle, there
 
         nothing = (jnp.zeros((), bool), jnp.zeros((), int), jnp.zeros((), v.dtype), value)
-        _, *state = lax.while_loop(lambda s: ~s[1] & (s[0] < ahead), drawn_ahead, (0, *nothing))
-        start = (angles[-1, -1], low, high, *state)
-        state = lax.while_loop(lambda s: ~s[3] & (s[4] < max_candidates), drawn_now, start)
-        found, tried, angle, there = state[3:]
+        tried_ahead = lax.while_loop(lambda s: ~s[1] & (s[0] < ahead), drawn_ahead, (0, *nothing))[1:]
+        start = (angles[-1, -1], low, high, *tried_ahead)
+        found, tried, angle, there = lax.while_loop(lambda s: ~s[3] & (s[4] < max_candidates), drawn_now, start)[3:]
         angle, value = jnp.where(found, angle, 0.0), jnp.where(found, there, value)
         return (v * jnp.cos(angle) + noise * jnp.sin(angle), value), (tried, ~found)
 
