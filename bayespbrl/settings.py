@@ -162,8 +162,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     # difference.
     # hyperparameters: one-hot features have no length scale, and choosing steepness and lapse rate by evidence puts off
     # the lower quartile's 0.99 on the same seeds from answer 8 to 13.
-    # exploration_hold: seeds 0-19, the lower quartile's 0.99 comes at answer 6 or before, without it at 8; on the reported
-    # seeds, without it, at answer 10 with one version's draws and at 15 with another's.
+    # exploration_hold: seeds 0-19, the lower quartile's 0.99 comes at answer 6 or before, without it at 8; on seeds
+    # 1000-1019 without it at answer 10 with one version's draws and at 15 with another's.
     "gridworld": {"iterations": 25, "discount": 0.995, "hyperparameters": "given", "exploration_hold": 3},
     # kl_bound, ridges: the paper's authors'. Half the median rule: with the known reward, seeds 0 and 1, a quarter and
     # a half end alike (-950 to -1000), and the whole rule had reached -1900 by iteration 9. 300 centres, not 700: the
