@@ -170,11 +170,11 @@ def _fit_gaussian(differences: np.ndarray, prior_scale: float, likelihood: Likel
     if np.ndim(mixture.weights) == 2:
         mixture = mixture._replace(constant=np.asarray(mixture.constant)[used], weights=mixture.weights[used])
     approximation = expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale)
-    with jax.enable_x64(True):
-        at_zero = np.asarray(_log_prob(likelihood, np.zeros(len(used)))) if len(used) else np.zeros(0)
-    return GaussianFit(
-        factors, likelihood, prior_scale, approximation, approximation.log_evidence + float(np.sum(at_zero[~used]))
-    )
+    log_evidence = approximation.log_evidence
+    if not np.all(used):  # rows of zeros have a factor of their own; else nothing is compiled for a new K
+        with jax.enable_x64(True):
+            log_evidence += float(np.sum(np.asarray(_log_prob(likelihood, np.zeros(len(used))))[~used]))
+    return GaussianFit(factors, likelihood, prior_scale, approximation, log_evidence)
 
 
 @cache
@@ -213,7 +213,7 @@ class _Chains:
         )
         # from the reference, which is wider than the posterior's bulk: those that agree have forgotten their start
         noise = np.random.default_rng(seed).standard_normal((num_chains, len(problem.centre)))
-        start = problem.centre + noise @ problem.root.T
+        start = np.asarray(problem.centre) + noise @ np.asarray(problem.root).T
         start, zeros = jnp.asarray(start), jnp.zeros(num_chains)
         keys = jax.random.split(jax.random.key(seed), num_chains)
         state = EllipticalSliceState({"utility_weights": start}, zeros, zeros, zeros.astype(bool), keys)
