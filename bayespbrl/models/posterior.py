@@ -130,7 +130,8 @@ def sample_posterior(
         wanted = num_samples
         while True:
             chains = chains.extended(wanted - chains.length)
-            report = convergence(chains.collected("coordinates", wanted) @ fit.factors.loadings.T)
+            margins = chains.collected("coordinates", wanted) @ fit.factors.loadings.T
+            report = convergence(margins, with_error=False)
             if report.converged() or 2 * wanted > max_samples:
                 break
             wanted *= 2
