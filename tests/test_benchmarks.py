@@ -41,7 +41,7 @@ def test_log_evidence_of_41_answers_agrees_with_annealed_particles_within_a_nat(
 
 @pytest.mark.slow
 def test_the_seconds_of_the_steps_of_a_trial_add_up():
-    arguments = ["bicycle", "--iterations", "2", "--centres", "30", "--seed", "4"]
+    arguments = ["bicycle", "--iterations", "2", "--centres", "100", "--seed", "4"]
     run = subprocess.run([sys.executable, str(CYCLE), *arguments], capture_output=True, text=True, check=True)
     *table, line = run.stdout.splitlines()
     result = json.loads(line)
