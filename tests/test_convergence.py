@@ -44,13 +44,3 @@ def test_nothing_to_estimate_has_converged():
 def test_too_few_draws_are_named():
     with pytest.raises(ValueError, match="draws: expected shape"):
         convergence(np.zeros(5))
-
-
-def test_without_the_error_the_rest_is_the_same():
-    draws = np.random.default_rng(0).normal(size=(4, 50, 3))
-    draws[:, :, 2] = 1.0
-    whole, quick = convergence(draws), convergence(draws, with_error=False)
-    np.testing.assert_array_equal(quick.rhat, whole.rhat)
-    np.testing.assert_array_equal(quick.effective_sample_size, whole.effective_sample_size)
-    assert np.all(whole.monte_carlo_error[:2] > 0)
-    assert np.all(np.isnan(quick.monte_carlo_error))

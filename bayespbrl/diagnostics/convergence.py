@@ -18,7 +18,7 @@ class Convergence:
     Attributes:
       rhat: rank-normalised split R̂.
       effective_sample_size: bulk.
-      monte_carlo_error: standard error of the mean; NaN where it was not asked for.
+      monte_carlo_error: standard error of the mean.
     """
 
     rhat: np.ndarray
@@ -40,11 +40,8 @@ class Convergence:
         return self.rhat_max <= rhat_max and self.effective_sample_size_min >= effective_sample_size_min
 
 
-def convergence(draws: np.ndarray, *, with_error: bool = True) -> Convergence:
+def convergence(draws: np.ndarray) -> Convergence:
     """Diagnose `draws`, shape (chain, draw, ...), at least two chains or four draws.
-
-    Args:
-      with_error: whether the Monte Carlo error is wanted, which takes a third of the time.
 
     Raises:
       ValueError: fewer than two dimensions.
@@ -55,14 +52,13 @@ def convergence(draws: np.ndarray, *, with_error: bool = True) -> Convergence:
     flat = draws.reshape(*draws.shape[:2], -1)
     rhat = np.ones(flat.shape[2])
     size = np.full(flat.shape[2], float(flat.shape[0] * flat.shape[1]))
-    error = np.full(flat.shape[2], 0.0 if with_error else np.nan)
+    error = np.zeros(flat.shape[2])
     # a NaN is not constant: it must reach the diagnostics and fail there
     varies = ~np.all(flat == flat[:1, :1], axis=(0, 1))
     if varies.any():
         axes = {"chain_axis": 0, "draw_axis": 1}
         rhat[varies] = array_stats.rhat(flat[:, :, varies], **axes)
         size[varies] = array_stats.ess(flat[:, :, varies], method="bulk", **axes)
-        if with_error:
-            error[varies] = array_stats.mcse(flat[:, :, varies], method="mean", **axes)
+        error[varies] = array_stats.mcse(flat[:, :, varies], method="mean", **axes)
     shape = draws.shape[2:]
     return Convergence(rhat.reshape(shape), size.reshape(shape), error.reshape(shape))

@@ -130,8 +130,7 @@ def sample_posterior(
         wanted = num_samples
         while True:
             chains = chains.extended(wanted - chains.length)
-            margins = chains.collected("coordinates", wanted) @ fit.factors.loadings.T
-            report = convergence(margins, with_error=False)
+            report = convergence(chains.collected("coordinates", wanted) @ fit.factors.loadings.T)
             if report.converged() or 2 * wanted > max_samples:
                 break
             wanted *= 2
