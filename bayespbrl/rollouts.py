@@ -175,16 +175,16 @@ def _start(dynamics: FuncEnv, key: jax.Array) -> tuple[tuple[Any, Any, Any], jax
 
 
 def _advance(
-    dynamics: FuncEnv, policy: Any, running: tuple[Any, Any, Any], steps_key: jax.Array, t: Any, hold: Any = 1
+    dynamics: FuncEnv, policy: Any, running: tuple[Any, Any, Any], steps_key: jax.Array, t: Any, drawn: Any = None
 ) -> Any:
-    """One step of one episode; an episode that has ended stays as it is and earns nothing."""
+    """One step of one episode; an episode that has ended stays as it is and earns nothing.
+
+    `drawn` is the step whose chance the action shares; its own when None.
+    """
     state, observation, alive = running
-    phase = jax.random.randint(jax.random.fold_in(steps_key, _PHASE), (), 0, hold)
-    drawn = jnp.maximum(
-        (t + phase) // hold * hold - phase, 0
-    )  # when the action's chance was, or would have been, drawn
-    action_key, _ = jax.random.split(jax.random.fold_in(steps_key, drawn))
-    _, transition_key = jax.random.split(jax.random.fold_in(steps_key, t))
+    action_key, transition_key = jax.random.split(jax.random.fold_in(steps_key, t))
+    if drawn is not None:
+        action_key, _ = jax.random.split(jax.random.fold_in(steps_key, drawn))
     action = _clipped(dynamics.action_space, policy.sample(action_key, observation))
     next_state, next_observation, reward, terminated = functional.step(dynamics, transition_key, state, action)
 
@@ -203,9 +203,11 @@ def _simulate(dynamics: FuncEnv, policy: Any, key: jax.Array, hold: Any, *, epis
     def episode(key: jax.Array) -> Any:
         running, steps_key = _start(dynamics, key)
         first = running[1]
+        phase = jax.random.randint(jax.random.fold_in(steps_key, _PHASE), (), 0, hold)
 
         def scan_step(running: Any, t: Any) -> Any:
-            running, outcome = _advance(dynamics, policy, running, steps_key, t, hold)
+            drawn = jnp.maximum((t + phase) // hold * hold - phase, 0)
+            running, outcome = _advance(dynamics, policy, running, steps_key, t, drawn)
             return running, (running[1], *outcome)
 
         _, (observations, actions, rewards, terminated, alive) = jax.lax.scan(scan_step, running, jnp.arange(steps))

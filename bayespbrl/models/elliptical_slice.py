@@ -21,8 +21,8 @@ from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import compute_log_probs
 from numpyro.util import is_prng_key
 
-# So many batches of candidate angles are drawn for all moves at once; a move that needs more draws them itself, which
-# costs as much as three batches.
+# So many batches of candidate angles are drawn for all moves at once; a move that needs more draws them itself, with a
+# random generator in its inner loop.
 BATCHES_AHEAD = 2
 GAUSSIANS = (dist.Normal, dist.MultivariateNormal, dist.LowRankMultivariateNormal, dist.GaussianRandomWalk)
 
