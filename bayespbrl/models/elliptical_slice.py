@@ -100,48 +100,76 @@ def elliptical_moves(
     v = ellipse.lift(x)
     noise = ellipse.noise(key_noise, moves)
     uniforms = random.uniform(key_uniform, (moves, ahead * batch + 1), dtype=x.dtype)
+    heights = jnp.log(uniforms[:, 0])
     first = 2 * jnp.pi * uniforms[:, 1]
     rest, low, high = shrink(first, first - 2 * jnp.pi, first, uniforms[:, 2:])
     angles = jnp.concatenate([first[:, None], rest], axis=1).reshape(moves, ahead, batch)
+    brackets = jnp.stack([angles[:, -1, -1], low, high], axis=1)
+    keys = random.split(key_more, moves)
 
-    def move(carry, drawn):
-        (v, value), (noise, level, angles, low, high, key) = carry, drawn
-        level = value + level
-
-        def first_accepted(angles):
-            """Whether there is one, how many were tried, its angle and its residual."""
-            axes = (slice(None),) + (None,) * v.ndim
-            values = ellipse.residual(v * jnp.cos(angles)[axes] + noise * jnp.sin(angles)[axes])
-            # NaN compares as false, so that a NaN candidate is rejected
-            accepted = values > level
-            best, found = jnp.argmax(accepted), jnp.any(accepted)
-            return found, jnp.where(found, best + 1, batch), angles[best], values[best]
-
-        def drawn_ahead(state):
-            batches, _, tried, *_ = state
-            found, more, angle, there = first_accepted(angles[batches])
-            return batches + 1, found, tried + more, angle, there
-
-        def drawn_now(state):
-            last, low, high, _, tried, *_ = state
-            fresh = random.uniform(random.fold_in(key, tried), (batch,), dtype=v.dtype)
-            candidates, low, high = shrink(last, low, high, fresh)
-            found, more, angle, there = first_accepted(candidates)
-            return candidates[-1], low, high, found, tried + more, angle, there
-
-        nothing = (jnp.zeros((), bool), jnp.zeros((), int), jnp.zeros((), v.dtype), value)
-        tried_ahead = lax.while_loop(lambda s: ~s[1] & (s[0] < ahead), drawn_ahead, (0, *nothing))[1:]
-        start = (angles[-1, -1], low, high, *tried_ahead)
-        found, tried, angle, there = lax.while_loop(lambda s: ~s[3] & (s[4] < max_candidates), drawn_now, start)[3:]
-        angle, value = jnp.where(found, angle, 0.0), jnp.where(found, there, value)
-        return (v * jnp.cos(angle) + noise * jnp.sin(angle), value), (tried, ~found)
+    # One loop over the batches of all moves, not a loop of loops: where chains run side by side, none waits for the
+    # slowest at every move, only at the end.
+    def evaluate(walk: _Walk) -> _Walk:
+        candidates, bracket = _next_candidates(walk, angles, brackets, keys)
+        axes = (slice(None),) + (None,) * v.ndim
+        fresh = noise[walk.move]
+        values = ellipse.residual(walk.v * jnp.cos(candidates)[axes] + fresh * jnp.sin(candidates)[axes])
+        # NaN compares as false, so that a NaN candidate is rejected
+        accepted = values > walk.value + heights[walk.move]
+        best, found = jnp.argmax(accepted), jnp.any(accepted)
+        failed = ~found & ((walk.batches + 1) * batch >= jnp.maximum(max_candidates, ahead * batch))
+        angle = jnp.where(found, candidates[best], 0.0)
+        return _Walk(
+            v=walk.v * jnp.cos(angle) + fresh * jnp.sin(angle),
+            value=jnp.where(found, values[best], walk.value),
+            move=walk.move + (found | failed),
+            batches=jnp.where(found | failed, 0, walk.batches + 1),
+            bracket=bracket,
+            tried=walk.tried + jnp.where(found, best + 1, batch),
+            stuck=walk.stuck | failed,
+        )
 
     # a current point that is impossible or NaN is left for any that is possible
     value = ellipse.residual(v[None])[0]
     value = jnp.where(value > -jnp.inf, value, -jnp.inf)
-    drawn = (noise, jnp.log(uniforms[:, 0]), angles, low, high, random.split(key_more, moves))
-    (v, _), (tried, stuck) = lax.scan(move, (v, value), drawn)
-    return ellipse.lower(v), jnp.sum(tried), jnp.any(stuck)
+    zero = jnp.zeros((), int)
+    start = _Walk(v, value, zero, zero, brackets[0], zero, jnp.zeros((), bool))
+    end = lax.while_loop(lambda walk: walk.move < moves, evaluate, start)
+    return ellipse.lower(end.v), end.tried, end.stuck
+
+
+class _Walk(NamedTuple):
+    """Where a chain is within its moves: the point v and its residual, the move, the batches of candidates that this
+    move has seen, the bracket (last angle, low, high) beyond those drawn ahead, the candidates tried by all moves."""
+
+    v: jax.Array
+    value: jax.Array
+    move: jax.Array
+    batches: jax.Array
+    bracket: jax.Array
+    tried: jax.Array
+    stuck: jax.Array
+
+
+def _next_candidates(
+    walk: _Walk, angles: jax.Array, brackets: jax.Array, keys: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The next batch of angles of the walk's move: drawn ahead, or now where those are used up; and the bracket."""
+    _, ahead, batch = angles.shape
+
+    def draw(state):
+        _, bracket, wanted = state
+        last, low, high = jnp.where(wanted == ahead, brackets[walk.move], bracket)
+        uniforms = random.uniform(random.fold_in(keys[walk.move], wanted * batch), (batch,), dtype=low.dtype)
+        candidates, low, high = shrink(last, low, high, uniforms)
+        return candidates, jnp.stack([candidates[-1], low, high]), -jnp.ones_like(wanted)
+
+    # A loop that runs once or not at all: a conditional, in a batch of chains, would draw in any case. What it draws
+    # from is part of its state, or the compiler would move the drawing before the loop.
+    prepared = angles[walk.move, jnp.minimum(walk.batches, ahead - 1)]
+    start = (prepared, walk.bracket, jnp.where(walk.batches < ahead, -1, walk.batches))
+    candidates, bracket, _ = lax.while_loop(lambda state: state[2] >= 0, draw, start)
+    return candidates, bracket
 
 
 class EllipticalSlice(MCMCKernel):

@@ -27,7 +27,7 @@ from bayespbrl.models.preference_model import (
 
 # Share of each answer's Gaussian factor that enters the reference: with all of it the reference is as narrow as the
 # posterior's bulk and its residual has no bound in the tails; towards none it is the prior, which mixes badly.
-REFERENCE_POWER = 0.6
+REFERENCE_POWER = 0.5
 # Moves round the reference's and the prior's ellipses per recorded draw.
 REFERENCE_MOVES, PRIOR_MOVES = 30, 2
 # Draws that one call of the compiled sampler makes; its length is part of what is compiled.
