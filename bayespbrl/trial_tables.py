@@ -10,9 +10,10 @@ import jax
 import numpy as np
 import xarray as xr
 
-from bayespbrl import rollouts, runs
+from bayespbrl import rollouts
 from bayespbrl.cycle import Learner
 from bayespbrl.envs import bicycle
+from bayespbrl.run_directory import read_summary
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value")
 
@@ -28,7 +29,7 @@ def collect(directories: Sequence[Path | str]) -> xr.Dataset:
     Numbers and lists of numbers are kept, the latter with a dimension of their own, and those of an entry that has
     names in it, as `seconds` has, under both names: `seconds_utility`. What is missing is NaN.
     """
-    summaries = [runs.read_summary(path) for path in directories]
+    summaries = [read_summary(path) for path in directories]
     seeds = [summary["seed"] for summary in summaries]
     iterations = [entry["iteration"] for entry in summaries[0]["iterations"]]
     rows = [[_flat(entry) for entry in summary["iterations"]] for summary in summaries]

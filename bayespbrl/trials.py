@@ -15,6 +15,7 @@ from bayespbrl import runs, trial_tables
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.experts import simulated_expert
 from bayespbrl.rollouts import open_environment
+from bayespbrl.run_directory import RunDirectory, read_summary
 from bayespbrl.settings import Settings, settings_for
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -137,10 +138,10 @@ class _Study:
         path = self.path(seed)
         if not path.exists():
             return None
-        kept = runs.RunDirectory.open(path)
+        kept = RunDirectory.open(path)
         if kept.settings != replace(self.settings, seed=seed):
             raise ValueError(f"{path}: expected a trial with these settings, got one with others: {kept.settings}")
-        if (path / "summary.json").exists() and self.redraws(runs.read_summary(path)["iterations"]):
+        if (path / "summary.json").exists() and self.redraws(read_summary(path)["iterations"]):
             return False
         measured = self.balancing_steps is None or trial_tables.has_balancing(path)
         return True if measured and kept.finished() else None

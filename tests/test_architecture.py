@@ -28,6 +28,7 @@ GROUPS = {
     "memory": ["records"],
     "events": ["events"],
     "cycle": ["cycle"],
+    "run directory": ["run_directory", "iteration_files"],
     "runs": ["runs"],
     "diagnostics": ["diagnostics"],
     "report": ["diagnostics.report"],
@@ -37,7 +38,7 @@ GROUPS = {
 }
 GROUND = ["numerics", "convergence", "environments"]
 FLOWS = [*GROUND, "models", "policies", "what flows round"]
-LEARNED = [*FLOWS, "steps", "schedules", "plain data", "memory", "events", "cycle", "runs"]
+LEARNED = [*FLOWS, "steps", "schedules", "plain data", "memory", "events", "cycle", "run directory", "runs"]
 ALLOWED = {
     "numerics": [],
     "convergence": [],
@@ -51,6 +52,7 @@ ALLOWED = {
     "memory": [],
     "events": ["what flows round"],
     "cycle": [*FLOWS, "steps", "schedules", "plain data", "events"],
+    "run directory": [*FLOWS, "steps", "plain data", "memory", "events"],
     "runs": [*LEARNED, "report"],  # `Run.report` calls it, and imports it when called
     "diagnostics": [*LEARNED, "trials"],
     "report": [*LEARNED, "diagnostics", "trials"],
@@ -59,7 +61,16 @@ ALLOWED = {
     "command line": [*LEARNED, "diagnostics", "report", "trials", "film"],
 }
 # These import each other.
-WITHIN = {"environments", "models", "policies", "what flows round", "diagnostics", "trials", "command line"}
+WITHIN = {
+    "environments",
+    "models",
+    "policies",
+    "what flows round",
+    "run directory",
+    "diagnostics",
+    "trials",
+    "command line",
+}
 
 
 def group_of(module):

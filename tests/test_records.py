@@ -117,8 +117,8 @@ def test_a_class_of_somebody_elses_is_not_made_unless_it_is_passed():
     "name",
     [
         "os:system",
-        "bayespbrl.runs:os.system",
-        "bayespbrl.runs:shutil",
+        "bayespbrl.run_directory:os.system",
+        "bayespbrl.run_directory:shutil",
         "bayespbrl.runs:load",
         "bayespbrl.nowhere:Thing",
         "bayespbrl.features:Nothing",

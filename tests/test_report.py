@@ -24,6 +24,7 @@ from bayespbrl.diagnostics.report import assembled, write_report
 from bayespbrl.diagnostics.report_answers import surprise_order
 from bayespbrl.diagnostics.report_evidence import read_evidence
 from bayespbrl.diagnostics.report_findings import figure
+from bayespbrl.iteration_files import read_iteration
 from bayespbrl.trajectories import trajectory_features
 
 QUICK = {"iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
@@ -163,7 +164,7 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(f
     log = [json.loads(line) for line in (finished / "events.jsonl").read_text().splitlines()]
     asked = [event for event in log if event["event"] == "asked"][-1]
     said = [event for event in log if event["event"] == "answered"][-1]["answer"]
-    parts = bayespbrl.runs.read_iteration(finished / "iterations" / "0002.nc", "improved")
+    parts = read_iteration(finished / "iterations" / "0002.nc", "improved")
     both = [run.trajectories[asked[name]] for name in ("first", "second")]
     sums = trajectory_features(both, parts["estimate"].features, discount=run.settings.discount)
     difference = (sums[[0]] - sums[[1]]) / parts["estimate"].scale

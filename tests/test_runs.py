@@ -16,9 +16,9 @@ import pytest
 import xarray as xr
 
 import bayespbrl
-from bayespbrl import Learner, ReturnExpert, runs
+from bayespbrl import Learner, ReturnExpert, run_directory, runs
 from bayespbrl.policies import TabularPolicy
-from bayespbrl.runs import RunDirectory
+from bayespbrl.run_directory import RunDirectory
 
 QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
 FILES = {"settings.json", "events.jsonl", "summary.json", "iterations"}
@@ -153,8 +153,8 @@ def test_evaluation_is_a_function_of_the_seed(finished):
 
 def test_a_directory_appears_with_its_settings_in_it_or_not_at_all(tmp_path, monkeypatch):
     seen = []
-    write = runs._write
-    monkeypatch.setattr(runs, "_write", lambda file, text: seen.append(file) or write(file, text))
+    write = run_directory._write
+    monkeypatch.setattr(run_directory, "_write", lambda file, text: seen.append(file) or write(file, text))
     learner = start(tmp_path / "deep" / "run")
     assert seen[0].parent != tmp_path / "deep" / "run"  # written aside
     assert {path.name for path in (tmp_path / "deep").iterdir()} == {"run"}
@@ -164,7 +164,7 @@ def test_a_directory_appears_with_its_settings_in_it_or_not_at_all(tmp_path, mon
     def full(file, text):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(runs, "_write", full)
+    monkeypatch.setattr(run_directory, "_write", full)
     with pytest.raises(ValueError, match=r"other: cannot make a run directory there \(no space left"):
         start(tmp_path / "other")
     assert {path.name for path in tmp_path.iterdir()} == {"deep"}
@@ -348,7 +348,7 @@ def test_an_event_that_could_not_be_kept_is_taken_back_and_can_be_tried_again(tm
         raise error("stopped")
 
     if fails == "summary":
-        monkeypatch.setattr(runs, "_write", fail)
+        monkeypatch.setattr(run_directory, "_write", fail)
     else:
         monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(error, match="stopped"):

@@ -16,8 +16,9 @@ from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
 from bayespbrl.diagnostics.report_log import AnswerRecord, read_log
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.features import checked_features
+from bayespbrl.iteration_files import read_parts
 from bayespbrl.preferences import Preferences
-from bayespbrl.runs import RunDirectory, read_parts
+from bayespbrl.run_directory import RunDirectory
 from bayespbrl.settings import WITHOUT_POSTERIOR, Settings
 from bayespbrl.trajectories import Trajectory, trajectory_features
 
