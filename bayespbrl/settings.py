@@ -183,13 +183,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fixed_point_ridge": 1e-5,
         "projection_ridge": 1e-5,
     },
-    # Posterior mean, seeds 106-109, mean of three last values in increasing order, 16 to 25 iterations: twice the median
-    # rule for all features, first scale 0.75 and the last four iterations' states: -19 on seed 106, where the known
-    # reward ends at -11; first scale 1.5 and all states: -17, -13, -11, -10; and three times the rule for the utility:
-    # -13, -11, -11, -10; first scale 3 instead: -16, -12, -11, -10. Known reward, seeds 106 and 107: ridges of 1e-8 -12
-    # and -16, of 1e-5 -8 and -10, of 1e-3 -16 and -11; discount 0.95 below -16, 0.99 -18 and -10; kl_bound 0.6
-    # and 0.99 -13 on seed 106; a linear-Gaussian policy -35. hyperparameters: seeds 100 and 101, by evidence -26, -60, given
-    # -12, -25 with an older preset: four length scales are more than these answers can tell.
+    # Posterior mean, seeds 106-109, mean of three last values in increasing order, 16 to 25 iterations: twice the
+    # median rule for all features, first scale 0.75 and the last four iterations' states: -19 on seed 106, where the
+    # known reward ends at -11; first scale 1.5 and all states: -17, -13, -11, -10; and three times the rule for the
+    # utility: -13, -11, -11, -10; first scale 3 instead: -16, -12, -11, -10. Known reward, seeds 106 and 107: ridges of
+    # 1e-8 -12 and -16, of 1e-5 -8 and -10, of 1e-3 -16 and -11; discount 0.95 below -16, 0.99 -18 and -10; kl_bound 0.6
+    # and 0.99 -13 on seed 106; a linear-Gaussian policy -35. hyperparameters: seeds 100 and 101, by evidence -26, -60,
+    # given -12, -25 with an older preset: four length scales are more than these answers can tell.
     "bicycle": {
         "iterations": 25,
         "kl_bound": 0.3,
@@ -202,9 +202,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fixed_point_ridge": 1e-5,
         "projection_ridge": 1e-5,
     },
-    # Ridges, bandwidths, bound and first scale are the paper's authors'. discount: the goal comes after 100 to 500 steps,
-    # where 0.98 leaves nothing of it, neither in ψ nor in Q. Posterior mean, seeds 100-107, 10 iterations: with 0.995
-    # all end between -91 and -118; with 0.98 seeds 100-103 reach -150 up to three iterations later, and three of
+    # Ridges, bandwidths, bound and first scale are the paper's authors'. discount: the goal comes after 100 to 500
+    # steps, where 0.98 leaves nothing of it, neither in ψ nor in Q. Posterior mean, seeds 100-107, 10 iterations: with
+    # 0.995 all end between -91 and -118; with 0.98 seeds 100-103 reach -150 up to three iterations later, and three of
     # the seeds 1000-1009 never left -500.
     "acrobot": {
         "iterations": 15,
@@ -222,8 +222,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     # 0.995: 356 and 447 (mean of the last three 452, 439); with kl_bound 0.3 and four iterations' states 389, 481.
     # The curves are not monotone.
     "CartPole-v1": {"iterations": 15, "kl_bound": 0.1, "discount": 0.995},
-    # The swing-up's settings: the same task, but for the starts, which are anywhere. Seed 100: -412 after 11 answers, -695
-    # after 16; discount 0.995: -480 and -583.
+    # The swing-up's settings: the same task, but for the starts, which are anywhere. Seed 100: -412 after 11 answers,
+    # -695 after 16; discount 0.995: -480 and -583.
     "Pendulum-v1": {
         "iterations": 15,
         "kl_bound": 0.35,
