@@ -45,6 +45,11 @@ def low_rank(differences: np.ndarray) -> LowRank:
     return LowRank(loadings, directions @ right[:rank].T)
 
 
+def used_rows(loadings: np.ndarray) -> np.ndarray:
+    """Which answers tell anything: the rows of L, (K, r), that are not exactly zero; shape (K,) bool."""
+    return np.any(loadings != 0, axis=1)
+
+
 class UtilityWeights(BackendArray):
     """Draws of w = Q z + σ (I − QQᵀ) ε, shape (C, draws, D), computed where they are indexed.
 

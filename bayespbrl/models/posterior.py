@@ -16,7 +16,7 @@ from bayespbrl.diagnostics.convergence import Convergence, convergence
 from bayespbrl.models.elliptical_slice import EllipticalSlice, EllipticalSliceState
 from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
 from bayespbrl.models.likelihoods import Likelihood, WithTies, log_prob, preference_likelihood, total_log_prob
-from bayespbrl.models.low_rank import LowRank, UtilityWeights, low_rank
+from bayespbrl.models.low_rank import LowRank, UtilityWeights, low_rank, used_rows
 from bayespbrl.models.preference_model import (
     PreferenceProblem,
     low_rank_model,
@@ -165,7 +165,7 @@ def fit_gaussian(differences: np.ndarray, *, prior_scale: float, likelihood: Lik
 
 def _fit_gaussian(differences: np.ndarray, prior_scale: float, likelihood: Likelihood) -> GaussianFit:
     factors = low_rank(differences)
-    used = np.any(factors.loadings != 0, axis=1)
+    used = used_rows(factors.loadings)
     mixture = likelihood.probit_mixture()
     if np.ndim(mixture.weights) == 2:
         mixture = mixture._replace(constant=np.asarray(mixture.constant)[used], weights=mixture.weights[used])
@@ -203,7 +203,7 @@ class _Chains:
     def start(cls, fit: GaussianFit, *, num_chains: int, chunk: int, seed: int) -> "_Chains":
         loadings, approximation = fit.factors.loadings, fit.approximation
         site_precisions = np.zeros(len(loadings))
-        site_precisions[np.any(loadings != 0, axis=1)] = REFERENCE_POWER * approximation.site_precisions
+        site_precisions[used_rows(loadings)] = REFERENCE_POWER * approximation.site_precisions
         problem = padded_problem(
             loadings,
             fit.likelihood,

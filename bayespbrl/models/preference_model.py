@@ -15,6 +15,7 @@ from jax import random
 
 from bayespbrl.models.elliptical_slice import Ellipse
 from bayespbrl.models.likelihoods import Likelihood, WithTies, log_prob, total_log_prob
+from bayespbrl.models.low_rank import used_rows
 
 
 def preference_model(differences, likelihood: Likelihood, *, prior_scale=1.0, used=True) -> None:
@@ -129,7 +130,7 @@ def padded_problem(
     number, rank = loadings.shape
     capacity = _capacity(number)
     precisions, used = np.zeros(capacity), np.zeros(capacity, dtype=bool)
-    used[:number] = np.any(loadings != 0, axis=1)
+    used[:number] = used_rows(loadings)
     precisions[:number] = site_precisions
     padded, centre = np.zeros((capacity, capacity)), np.zeros(capacity)
     padded[:number, :rank], centre[:rank] = loadings, mean
