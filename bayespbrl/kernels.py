@@ -75,13 +75,22 @@ def radial_basis_row(
     point: Array, centres: Array | np.ndarray, bandwidths: Array | np.ndarray, period: Array | np.ndarray
 ) -> Array:
     """`radial_basis` of one point (S,), traceable by JAX; shape (D,)."""
-    bandwidths, period = jnp.asarray(bandwidths), jnp.asarray(period)
-    difference = jnp.asarray(point) - jnp.asarray(centres)
-    periodic = jnp.isfinite(period)
-    some_period = jnp.where(periodic, period, 1.0)  # no infinity inside: its gradient would be NaN
-    chord = jnp.where(periodic, jnp.sin(jnp.pi * difference / some_period) * some_period / jnp.pi, difference)
+    bandwidths = jnp.asarray(bandwidths)
     inverse = jnp.where(bandwidths > 0, 1 / jnp.where(bandwidths > 0, bandwidths, 1.0), 0.0)
-    return jnp.exp(-0.5 * jnp.sum(jnp.square(chord * inverse), axis=-1))
+    difference = _on_circles(jnp.asarray(point), period) - _on_circles(jnp.asarray(centres), period)
+    return jnp.exp(-0.5 * jnp.sum(jnp.square(difference * jnp.tile(inverse, 2)), axis=-1))
+
+
+def _on_circles(points: Array, period: Array | np.ndarray) -> Array:
+    """`coordinates` of shape (…, 2S), traceable: a plain dimension's second one is zero, whichever are periodic.
+
+    The centres' are the same for all points, so that no sine is taken of a difference.
+    """
+    periodic = jnp.isfinite(period)
+    radius = jnp.where(periodic, period, 1.0) / (2 * jnp.pi)  # no infinity inside: its gradient would be NaN
+    angles = points / radius
+    first = jnp.where(periodic, radius * jnp.cos(angles), points)
+    return jnp.concatenate([first, jnp.where(periodic, radius * jnp.sin(angles), 0.0)], axis=-1)
 
 
 def median_bandwidths(
