@@ -5,9 +5,9 @@
 The first study is the one that the others are compared with. For each: the median and lower quartile of the value at
 some numbers of answers and at the end; how many trials are lost, which is to end below `--lost`; the answers at which
 the lower quartile of the relative value (specification, section 1: (value − floor) / (ceiling − floor)) reaches 0.95;
-and the median difference to the first study over the same seeds, with a 95 % bootstrap interval. A study is a directory
-of `bayespbrl trials` or its table. The floor is the random policy's value; the ceiling a number, or a study with the
-known reward, whose median it is.
+and the median difference to the first study over the same seeds after as many answers as both have, with a 95 %
+bootstrap interval. A study is a directory of `bayespbrl trials` or its table. The floor is the random policy's value;
+the ceiling a number, or a study with the known reward, whose median it is.
 """
 
 import argparse
@@ -48,10 +48,11 @@ class Study:
 
 
 def paired(study: Study, reference: Study) -> str:
-    """The median difference of the last value over the seeds of both, with its bootstrap interval."""
+    """The median difference after as many answers as both have, over the seeds of both, with its bootstrap interval."""
     seeds = [seed for seed in study.seeds if seed in reference.seeds]
-    last, before = (np.array([one.values[one.seeds.index(seed), -1] for seed in seeds]) for one in (study, reference))
-    differences = last - before
+    answers = min(study.answers[-1], reference.answers[-1])
+    value, before = (one.at(answers)[[one.seeds.index(seed) for seed in seeds]] for one in (study, reference))
+    differences = value - before
     chosen = np.random.default_rng(0).integers(len(seeds), size=(10_000, len(seeds)))
     low, high = np.quantile(np.median(differences[chosen], axis=1), [0.025, 0.975])
     return f"{np.median(differences):+.1f} [{low:+.1f}, {high:+.1f}]"
