@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import add
 from typing import Any
 
 import jax
@@ -9,10 +11,12 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box
 
-from bayespbrl.lstd import lstd_q
+from bayespbrl.lstd import TransitionSums, solve_lstd, transition_sums
 from bayespbrl.policies import entropies, sample_actions
 from bayespbrl.reps import RepsSolution, reps_weights, reps_weights_by_state
 from bayespbrl.trajectories import Transitions
+
+ROWS_AT_A_TIME = 16_384
 
 
 @dataclass(frozen=True)
@@ -226,18 +230,23 @@ def estimate_q(
       discount, fixed_point_ridge, projection_ridge: of LSTD.
     """
     steps, utilities, counts = _counted(steps, utilities)
-    current = _with_bias(features(steps.states, steps.actions))
-    if is_discrete(policy):
-        following = _expected_features(policy, steps.next_states, features)
-    else:
-        following = features(steps.next_states, clipped(sample_actions(policy, key, steps.next_states), action_space))
-    following = _with_bias(following)
-    following[steps.terminal] = 0.0
-    repeats = np.sqrt(counts)[:, None]  # a row times √n enters every Gram matrix as n rows
-    weights = lstd_q(
-        current * repeats,
-        following * repeats,
-        (utilities.T * repeats[:, 0]).T,
+    following = None if is_discrete(policy) else clipped(sample_actions(policy, key, steps.next_states), action_space)
+
+    def sums(rows: slice) -> TransitionSums:
+        current = _with_bias(features(steps.states[rows], steps.actions[rows]))
+        if following is None:
+            successor = _expected_features(policy, steps.next_states[rows], features)
+        else:
+            successor = features(steps.next_states[rows], following[rows])
+        successor = _with_bias(successor)
+        successor[steps.terminal[rows]] = 0.0
+        repeats = np.sqrt(counts[rows])[:, None]  # a row times √n enters every Gram matrix as n rows
+        return transition_sums(current * repeats, successor * repeats, (utilities[rows].T * repeats[:, 0]).T)
+
+    # a block at a time: the features of all transitions would fill the memory of a long run
+    blocks = [slice(start, start + ROWS_AT_A_TIME) for start in range(0, len(steps), ROWS_AT_A_TIME)]
+    weights = solve_lstd(
+        reduce(add, map(sums, blocks)),
         discount=discount,
         fixed_point_ridge=fixed_point_ridge,
         projection_ridge=projection_ridge,

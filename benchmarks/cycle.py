@@ -34,7 +34,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
     "sampler": (models.sample_posterior,),
     "evidence": (utility.choose_hyperparameters,),
     "linear program": (models.linear_program,),
-    "LSTD": (lstd.lstd_q,),
+    "LSTD": (lstd.transition_sums, lstd.solve_lstd),
     "dual": (reps.reps_weights, reps.reps_weights_by_state),
     "CMA-ES": (hyperparameter_search.search,),
     "actions": (batch.sample_actions, batch.entropies),

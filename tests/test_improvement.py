@@ -6,7 +6,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from bayespbrl import improvement
-from bayespbrl.features import OneHot, StateActionProduct
+from bayespbrl.features import OneHot, StateActionProduct, draw_state_action_features
 from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, TabularPolicy, sample_actions
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
 
@@ -89,6 +89,27 @@ def test_q_of_utilities_side_by_side_is_that_of_each_alone():
         q_function = improvement.estimate_q(random_policy(), steps, alone, **options)
         np.testing.assert_allclose(together(states, actions)[:, column], q_function(states, actions), atol=1e-9)
     assert together(states, actions).shape == (STATES * ACTIONS, 3)
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_q_is_the_same_however_many_transitions_are_taken_at_a_time(monkeypatch, continuous):
+    if continuous:
+        rng = np.random.default_rng(0)
+        states = rng.normal(size=(40, 41, 2))
+        steps = transitions([Trajectory(s, rng.normal(size=(40, 1)), np.zeros(40), terminated=True) for s in states])
+        utilities, space = rng.normal(size=len(steps)), Box(-1, 1, (1,))
+        policy = LinearGaussianPolicy.initial(Box(-9, 9, (2,)), space)
+        features = draw_state_action_features(
+            Box(-9, 9, (2,)), space, steps.states, steps.actions, rng=rng, number_of_centres=9
+        )
+    else:
+        (steps, utilities), space, policy = random_steps(terminated=True), Discrete(ACTIONS), random_policy()
+        features = StateActionProduct(OneHot(STATES), ACTIONS)
+    options = {"key": jax.random.key(1), "action_space": space, "features": features, **OPTIONS}
+    at_once = improvement.estimate_q(policy, steps, utilities, **options)(steps.states, steps.actions)
+    monkeypatch.setattr(improvement, "ROWS_AT_A_TIME", 7)
+    in_blocks = improvement.estimate_q(policy, steps, utilities, **options)(steps.states, steps.actions)
+    np.testing.assert_allclose(in_blocks, at_once, atol=1e-6)
 
 
 def test_nothing_follows_a_terminal_state():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bayespbrl.lstd import lstd_q
+from bayespbrl.lstd import lstd_q, solve_lstd, transition_sums
 
 NO_PENALTY = {"fixed_point_ridge": 0.0, "projection_ridge": 0.0}
 
@@ -47,6 +47,19 @@ def test_penalised_weights_equal_the_formula_with_the_projection_written_out():
     expected = np.linalg.solve(design.T @ design + 0.1 * np.eye(4), design.T @ target)
     weights = lstd_q(features, following, utilities, discount=0.8, fixed_point_ridge=0.1, projection_ridge=0.2)
     np.testing.assert_allclose(weights, expected, atol=1e-10)
+
+
+def test_the_sums_of_two_blocks_are_those_of_all_transitions():
+    rng = np.random.default_rng(6)
+    features, following = rng.normal(size=(30, 4)), rng.normal(size=(30, 4))
+    utilities = rng.normal(size=(30, 2))
+    options = {"discount": 0.8, "fixed_point_ridge": 0.1, "projection_ridge": 0.2}
+    first, second = (
+        transition_sums(features[rows], following[rows], utilities[rows]) for rows in (slice(11), slice(11, None))
+    )
+    expected = lstd_q(features, following, utilities, **options)
+    np.testing.assert_allclose(solve_lstd(first + second, **options), expected, atol=1e-12)
+    assert np.abs(solve_lstd(first, **options) - expected).max() > 1e-3
 
 
 def test_features_that_never_occur_get_weight_zero():
