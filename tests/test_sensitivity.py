@@ -45,6 +45,13 @@ def test_answers_that_say_nothing_have_no_weight():
     assert np.all(of_component(result, "prior")[:2] > 0.06)
 
 
+@pytest.mark.parametrize("steepness", [1e-14, 1e-8])
+def test_answers_as_likely_under_every_draw_but_for_rounding_have_no_weight(steepness):
+    tree = sample_posterior(DIFFERENCES, steepness=steepness, likelihood="logistic", **SAMPLING)
+    assert np.ptp(tree["log_likelihood"]["answers"]) > 0
+    np.testing.assert_array_equal(of_component(sensitivity(tree), "likelihood"), 0)
+
+
 def test_answers_that_fix_a_utility_take_the_weight_from_the_prior():
     # six answers against two of the same pair: at steepness 20 the utility is known to a tenth of its prior spread
     rows = np.array([[0.4, 0.1]] * 6 + [[-0.4, -0.1]] * 2)

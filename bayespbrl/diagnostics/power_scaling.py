@@ -14,6 +14,9 @@ from bayespbrl.diagnostics.predictions import checked_differences
 from bayespbrl.models.low_rank import low_rank
 
 COMPONENTS = ("prior", "likelihood")
+# Standard deviation of a log density, in nats, below which no power of it moves a draw's weight by more than that, and
+# ArviZ's estimates of the weights' tail divide by zero.
+NOTHING_TO_WEIGH_BY = 1e-3
 
 
 def sensitivity(
@@ -30,7 +33,7 @@ def sensitivity(
 
     Returns:
       `sensitivity` (component, quantity) with components "prior" and "likelihood" (0 for a quantity that is the same in
-      every draw, or where there are no answers); `diagnosis` (quantity), by which of the two reach the threshold:
+      every draw, and where the answers are as likely under each, or there are none); `diagnosis` (quantity), by which of the two reach the threshold:
       "both" (prior and answers disagree, or the answers only bound what the prior spreads), "prior", "likelihood" or
       "neither"; and the attribute `threshold`.
 
@@ -46,8 +49,7 @@ def sensitivity(
     sensitivities = np.zeros((2, draws.shape[2]))
     groups = {"posterior": (("chain", "draw", "quantity"), draws[:, :, varies])}
     for row, (name, log_density) in enumerate(zip(COMPONENTS, (log_prior, log_likelihood), strict=True)):
-        # nothing to weigh the draws by: ArviZ's tail estimates would fail
-        if not varies.any() or np.ptp(log_density) == 0:
+        if not varies.any() or np.std(log_density) < NOTHING_TO_WEIGH_BY:
             continue
         group = {f"log_{name}": (("chain", "draw"), log_density)}
         parts = {key: xr.Dataset({"utility": value}, labels) for key, value in {**groups, **group}.items()}
