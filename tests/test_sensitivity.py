@@ -48,7 +48,7 @@ def test_answers_that_say_nothing_have_no_weight():
 @pytest.mark.parametrize("steepness", [1e-14, 1e-8])
 def test_answers_as_likely_under_every_draw_but_for_rounding_have_no_weight(steepness):
     tree = sample_posterior(DIFFERENCES, steepness=steepness, likelihood="logistic", **SAMPLING)
-    assert np.ptp(tree["log_likelihood"]["answers"]) > 0
+    assert np.ptp(tree["log_likelihood"]["answers"].values) > 0
     np.testing.assert_array_equal(of_component(sensitivity(tree), "likelihood"), 0)
 
 

@@ -33,9 +33,9 @@ def sensitivity(
 
     Returns:
       `sensitivity` (component, quantity) with components "prior" and "likelihood" (0 for a quantity that is the same in
-      every draw, and where the answers are as likely under each, or there are none); `diagnosis` (quantity), by which of the two reach the threshold:
-      "both" (prior and answers disagree, or the answers only bound what the prior spreads), "prior", "likelihood" or
-      "neither"; and the attribute `threshold`.
+      every draw, and where the answers are as likely under each draw, or there are none); `diagnosis` (quantity), by
+      which of the two reach the threshold: "both" (prior and answers disagree, or the answers only bound what the prior
+      spreads), "prior", "likelihood" or "neither"; and the attribute `threshold`.
 
     Raises:
       ValueError: features of another shape or not finite.
