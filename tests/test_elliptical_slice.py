@@ -10,6 +10,7 @@ from scipy import stats
 
 from bayespbrl.diagnostics.convergence import convergence
 from bayespbrl.models import EllipticalSlice, preference_model
+from bayespbrl.models.elliptical_slice import BATCHES_AHEAD, Ellipse, elliptical_moves
 from bayespbrl.models.likelihoods import Logistic, Mixed
 
 
@@ -110,6 +111,62 @@ def test_one_step_leaves_the_exact_law_as_it_is(reference, steepness, scale):
         p_value_after_moves(EllipticalSlice(preference_model, reference=reference), steepness=steepness, scale=scale)
         > 1e-3
     )
+
+
+def one_candidate_at_a_time(key, v, noise, log_density, *, moves, batch, max_candidates):
+    """Elliptical slice sampling as Murray, Adams and MacKay (2010) write it down, from the kernel's random numbers."""
+    ahead = min(BATCHES_AHEAD, -(-max_candidates // batch))
+    key_noise, key_uniform, key_more = jax.random.split(key, 3)
+    fresh = np.asarray(noise(key_noise, moves))
+    uniforms = np.asarray(jax.random.uniform(key_uniform, (moves, ahead * batch + 1)))
+    tried, stuck = [], []
+    for move, more in enumerate(jax.random.split(key_more, moves)):
+        level, drawn = log_density(v) + np.log(uniforms[move, 0]), list(uniforms[move, 1:])
+        angle = 2 * np.pi * drawn[0]
+        low, high = angle - 2 * np.pi, angle
+        candidate = v * np.cos(angle) + fresh[move] * np.sin(angle)
+        count = 1
+        while log_density(candidate) <= level and count < -(-max_candidates // batch) * batch:
+            low, high = (angle, high) if angle < 0 else (low, angle)
+            if count == len(drawn):
+                drawn += list(np.asarray(jax.random.uniform(jax.random.fold_in(more, count), (batch,))))
+            angle = low + (high - low) * drawn[count]
+            candidate = v * np.cos(angle) + fresh[move] * np.sin(angle)
+            count += 1
+        stuck.append(not log_density(candidate) > level)
+        tried.append(count)
+        v = v if stuck[-1] else candidate
+    return v, tried, stuck
+
+
+@pytest.mark.parametrize(("batch", "max_candidates"), [(1, 1000), (4, 1000), (3, 10), (1, 6), (8, 8)])
+def test_many_moves_in_one_loop_are_the_moves_of_the_textbook_one_by_one(batch, max_candidates):
+    moves, centre, width = 12, np.array([0.7, -0.4]), 0.003
+
+    def noise(key, number):
+        return jax.random.normal(key, (number, 2))
+
+    def residual(points):
+        return -0.5 * jnp.sum(((points - centre) / width) ** 2, axis=-1)
+
+    ellipse = Ellipse(lambda x: x, noise, residual, lambda v: v)
+    options = {"moves": moves, "batch": batch, "max_candidates": max_candidates}
+    walk = jax.jit(jax.vmap(lambda key: elliptical_moves(key, jnp.asarray(centre), ellipse, **options)))
+    keys = jax.random.split(jax.random.key(0), 8)
+    counted, given_up = [], []
+    for key, x, tried, stuck in zip(keys, *map(np.asarray, walk(keys)), strict=True):
+        expected, counts, failures = one_candidate_at_a_time(
+            key, centre, noise, lambda v: -0.5 * np.sum(((v - centre) / width) ** 2), **options
+        )
+        np.testing.assert_allclose(x, expected, atol=1e-12)
+        assert (tried, stuck) == (sum(counts), any(failures))
+        counted += counts
+        given_up.append(sum(failures))
+    # what is to be tested happens: moves that go beyond what was drawn ahead, or that are given up amid others
+    if max_candidates == 1000:
+        assert max(counted) > BATCHES_AHEAD * batch
+    else:
+        assert any(0 < number < moves for number in given_up)
 
 
 def test_batched_candidates_leave_the_law_of_a_draw_as_it_is():

@@ -93,9 +93,10 @@ def elliptical_moves(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`moves` elliptical slice steps from `x`; the new x, the number of candidates tried, and whether any got stuck.
 
-    `batch` candidates are evaluated at once, `max_candidates` at most; a move without an acceptable one stays.
+    `batch` candidates are evaluated at once, `max_candidates` at most, rounded up to whole batches; a move without an
+    acceptable one stays.
     """
-    ahead = max(1, min(BATCHES_AHEAD, -(-max_candidates // batch)))
+    ahead = min(BATCHES_AHEAD, -(-max_candidates // batch))
     key_noise, key_uniform, key_more = random.split(key, 3)
     v = ellipse.lift(x)
     noise = ellipse.noise(key_noise, moves)
@@ -116,16 +117,16 @@ def elliptical_moves(
         values = ellipse.residual(walk.v * jnp.cos(candidates)[axes] + fresh * jnp.sin(candidates)[axes])
         # NaN compares as false, so that a NaN candidate is rejected
         accepted = values > walk.value + heights[walk.move]
-        best, found = jnp.argmax(accepted), jnp.any(accepted)
-        failed = ~found & ((walk.batches + 1) * batch >= jnp.maximum(max_candidates, ahead * batch))
-        angle = jnp.where(found, candidates[best], 0.0)
+        first_accepted, found = jnp.argmax(accepted), jnp.any(accepted)
+        failed = ~found & ((walk.batches + 1) * batch >= max_candidates)
+        angle = jnp.where(found, candidates[first_accepted], 0.0)
         return _Walk(
             v=walk.v * jnp.cos(angle) + fresh * jnp.sin(angle),
-            value=jnp.where(found, values[best], walk.value),
+            value=jnp.where(found, values[first_accepted], walk.value),
             move=walk.move + (found | failed),
             batches=jnp.where(found | failed, 0, walk.batches + 1),
             bracket=bracket,
-            tried=walk.tried + jnp.where(found, best + 1, batch),
+            tried=walk.tried + jnp.where(found, first_accepted + 1, batch),
             stuck=walk.stuck | failed,
         )
 
@@ -140,7 +141,8 @@ def elliptical_moves(
 
 class _Walk(NamedTuple):
     """Where a chain is within its moves: the point v and its residual, the move, the batches of candidates that this
-    move has seen, the bracket (last angle, low, high) beyond those drawn ahead, the candidates tried by all moves."""
+    move has seen, the bracket (last angle, low, high) beyond those drawn ahead, the candidates tried by all moves, and
+    whether any move found none to accept."""
 
     v: jax.Array
     value: jax.Array
@@ -188,7 +190,8 @@ class EllipticalSlice(MCMCKernel):
       model: a NumPyro model.
       moves: moves round an ellipse per recorded draw.
       batch: candidate points evaluated at once; more where evaluations are cheap. The law of the draws is the same.
-      max_candidates: cap on the candidates of a move; a move that meets it stays and the state says `stuck`.
+      max_candidates: cap on the candidates of a move, rounded up to whole batches; a move that meets it stays and the
+        state says `stuck`.
       reference: (mean (n,), covariance (n, n)) of a Gaussian over the latent sites, flattened in the order of their
         sorted names. Half of the moves, at least one, then go round its ellipses and the rest, at least one, round the
         prior's, whose tails no narrower reference can be trusted with.
@@ -321,7 +324,7 @@ class EllipticalSlice(MCMCKernel):
             jax.vmap(residual),
             lambda v: mean + root @ v,
         )
-        return [(reference, max(self._moves // 2, 1)), (prior, max(self._moves - self._moves // 2, 1))]
+        return [(reference, max(self._moves // 2, 1)), (prior, self._moves - self._moves // 2)]
 
     def _trace(self, key, values, model_args, model_kwargs):
         model = substitute(substitute(seed(self._model, key), substitute_fn=init_to_sample), data=values)
