@@ -32,7 +32,7 @@ def transition_sums(features: np.ndarray, next_features: np.ndarray, utilities: 
         or utilities.ndim not in (1, 2)
     ):
         raise ValueError(
-            "lstd_q: expected features and next_features (N, Q) and utilities (N,) or (N, n), got "
+            "transitions: expected features and next_features (N, Q) and utilities (N,) or (N, n), got "
             f"{features.shape}, {next_features.shape} and {utilities.shape}"
         )
     return TransitionSums(features.T @ features, features.T @ next_features, features.T @ utilities)
@@ -48,6 +48,8 @@ def lstd_q(
     projection_ridge: float,
 ) -> np.ndarray:
     """Weights θ of Q(s, a) = φ(s, a)ᵀθ by regularised least-squares temporal differences.
+
+    For transitions whose features are in memory at once; the learner adds up `transition_sums` block by block.
 
     Args:
       features: φ(sᵢ, aᵢ), shape (N, Q).
@@ -92,7 +94,7 @@ def solve_lstd(
         raise ValueError(f"ridge: expected penalties >= 0, got {fixed_point_ridge} and {projection_ridge}")
     gram, cross, target = sums.gram, sums.cross, sums.target
     if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross)) and np.all(np.isfinite(target))):
-        raise ValueError("lstd_q: features and utilities must be finite, got NaN or infinity")
+        raise ValueError("transitions: expected finite features and utilities, got NaN or infinity")
     size = len(gram)
     projected = _solve_symmetric(gram, projection_ridge, np.column_stack([cross, target]))
     mixing = np.eye(size) - discount * projected[:, :size]  # M: X = ΦM

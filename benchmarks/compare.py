@@ -58,6 +58,11 @@ def paired(study: Study, reference: Study) -> str:
     return f"{np.median(differences):+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
+def summary(values: np.ndarray | None) -> str:
+    """Median [lower quartile] over trials."""
+    return "–" if values is None else f"{np.median(values):.4g} [{np.quantile(values, 0.25):.4g}]"
+
+
 def main() -> None:
     """Read the studies and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -80,8 +85,8 @@ def main() -> None:
     print("| study | trials | " + " | ".join(names) + " |")
     print("|---|" + "---|" * (len(names) + 1))
     for study in studies:
-        cells = [study.at(answers) for answers in columns] + [study.values[:, -1]]
-        row = [f"{np.median(cell):.4g} [{np.quantile(cell, 0.25):.4g}]" for cell in cells]
+        cells = [study.at(answers) if answers <= study.answers[-1] else None for answers in columns]
+        row = [summary(cell) for cell in [*cells, study.values[:, -1]]]
         row.append("–" if options.lost is None else str(int(np.sum(study.values[:, -1] < options.lost))))
         row.append("–" if reached is None else study.answers_to(reached, 0.25))
         row.append("–" if study is studies[0] else paired(study, studies[0]))

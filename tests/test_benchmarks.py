@@ -59,6 +59,7 @@ def test_the_seconds_of_the_steps_of_a_trial_add_up():
 
 def test_studies_are_compared_seed_by_seed(tmp_path):
     curves = {"first": {1: [0, 10, 20], 2: [0, 0, 4], 3: [0, 10, 12]}, "second": {3: [0, 20, 22], 1: [10, 20, 25]}}
+    curves["longer"] = {seed: [*values, -999] for seed, values in curves["second"].items()}
     for name, trials in curves.items():
         rows = [f"{seed},{i + 1},{i + 2},{value}" for seed, values in trials.items() for i, value in enumerate(values)]
         (tmp_path / f"{name}.csv").write_text("\n".join(["seed,iteration,answers,value", *rows]))
@@ -67,7 +68,9 @@ def test_studies_are_compared_seed_by_seed(tmp_path):
     command = [sys.executable, str(BENCHMARKS / "compare.py"), *arguments, *options]
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines[0] == "relative value 0.95: 22.32"  # 0.95 of the median of 22 and 25
-    first, second = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
+    first, second, longer = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
     assert first == ["first", "3", "12 [8]", "1", "never", "–"]
     # seeds 3 and 1 differ by 10 and 5, in the second study's order as in any other
     assert second == ["second", "2", "23.5 [22.75]", "0", "4", "+7.5 [+5.0, +10.0]"]
+    # a longer study is compared with the first at the answers that both have
+    assert longer == ["longer", "2", "-999 [-999]", "2", "4", "+7.5 [+5.0, +10.0]"]

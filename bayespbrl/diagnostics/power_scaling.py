@@ -14,8 +14,8 @@ from bayespbrl.diagnostics.predictions import checked_differences
 from bayespbrl.models.low_rank import low_rank
 
 COMPONENTS = ("prior", "likelihood")
-# Standard deviation of a log density, in nats, below which no power of it moves a draw's weight by more than that, and
-# ArviZ's estimates of the weights' tail divide by zero.
+# Standard deviation of a log density over the draws, in nats, below which the powers near 1 that are tried change
+# nothing worth telling, and ArviZ's estimates of the weights' tail divide by zero.
 NOTHING_TO_WEIGH_BY = 1e-3
 
 

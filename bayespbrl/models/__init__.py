@@ -1,4 +1,14 @@
-"""Densities and how to sample them."""
+"""Densities and how to sample them.
+
+likelihoods              what an answer says about a margin: eq. 8, lapses, Bradley-Terry, probit, ties
+preference_model         eq. 7 in NumPyro, and the ellipses that make it fast to sample
+elliptical_slice         the kernel, for any NumPyro model with Gaussian priors
+low_rank                 the part of the utility that the answers can see
+expectation_propagation  the Gaussian that the ellipses go round, and the evidence
+posterior                all of these together: chains until they have converged, as a DataTree
+hyperparameters          length scale, prior scale, steepness: what the answers speak for
+linear_program           eq. 10, the alternative to the posterior
+"""
 
 from bayespbrl.models.elliptical_slice import EllipticalSlice
 from bayespbrl.models.hyperparameters import (

@@ -1,4 +1,11 @@
-"""Stochastic policies: tabular, softmax, linear-Gaussian, Gaussian process."""
+"""Stochastic policies: tabular, softmax, linear-Gaussian, Gaussian process.
+
+policy                   the protocol that all follow; choice says which suits an environment
+tabular, softmax, linear_gaussian, gaussian_process
+sparse_regression        the weighted FITC regression of the Gaussian process
+hyperparameter_search    its bandwidths and variances by CMA-ES
+batch, actor             a policy at many observations, and at one
+"""
 
 from bayespbrl.policies.batch import entropies, log_probabilities, sample_actions
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
