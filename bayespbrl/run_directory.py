@@ -30,6 +30,7 @@ class RunDirectory:
     def __init__(self, path: Path, settings: Settings):
         self.path = path
         self.settings = settings
+        self._end: int | None = None  # bytes of the log as this learner left it
 
     @classmethod
     def create(cls, path: Path | str, settings: Settings) -> "RunDirectory":
@@ -55,7 +56,9 @@ class RunDirectory:
                 raise
         except OSError as error:
             raise ValueError(f"{path}: cannot make a run directory there ({error})") from error
-        return cls(path, settings)
+        made = cls(path, settings)
+        made._end = 0
+        return made
 
     @classmethod
     def open(cls, path: Path | str) -> "RunDirectory":
@@ -77,7 +80,16 @@ class RunDirectory:
             raise ValueError(f"{file}: {error}") from error
 
     def append(self, entry: Entry, state: LearnerState) -> None:
-        """Keep one event: first its heavy parts, then its line, flushed to the disk."""
+        """Keep one event: first its heavy parts, then its line, flushed to the disk.
+
+        Raises:
+          ValueError: another learner has gone on with the run in the meantime; nothing is written then.
+        """
+        if self._end is not None and self._end != self._log_size():
+            raise ValueError(
+                f"{self.path}: expected the run as this learner left it, but another one has gone on with it; "
+                "resume it to go on from there"
+            )
         if entry.parts:
             write_iteration(self.iteration_file(entry.event["iteration"]), entry)
         line = (json.dumps(dict(entry.event), allow_nan=False) + "\n").encode()
@@ -89,6 +101,7 @@ class RunDirectory:
                 os.fsync(file.fileno())
                 if entry.event["event"] in ("improved", "undone"):
                     self.write_summary(state)
+                self._end = file.tell()
             except BaseException:  # a full disk or Ctrl-C: the learner will not have moved on either
                 file.truncate(before)
                 raise
@@ -124,12 +137,18 @@ class RunDirectory:
 
     def drop_partial_line(self) -> None:
         """Cut off a last line that a killed process left half-written, so that the next event starts a new one."""
+        self._end = 0
         file = self.path / "events.jsonl"
         if file.exists():
             whole = file.read_bytes()
             complete = whole[: whole.rfind(b"\n") + 1]
+            self._end = len(complete)
             if complete != whole:
                 os.truncate(file, len(complete))
+
+    def _log_size(self) -> int:
+        file = self.path / "events.jsonl"
+        return file.stat().st_size if file.exists() else 0
 
     def _complete_lines(self) -> list[str]:
         file = self.path / "events.jsonl"

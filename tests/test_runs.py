@@ -250,6 +250,21 @@ def test_a_finished_run_is_finished_when_resumed(copy):
     assert contents(copy) == before
 
 
+def test_of_two_learners_on_one_run_the_second_to_write_is_refused_and_nothing_is_lost(tmp_path, straight):
+    first = start(tmp_path / "run")
+    expert = ReturnExpert()
+    first.tell([expert(*query.trajectories) for query in first.ask()])
+    second = bayespbrl.resume(tmp_path / "run")
+    queries = first.ask()
+    second.tell([expert(*query.trajectories) for query in second.ask()])
+    kept = contents(tmp_path / "run")
+    with pytest.raises(ValueError, match="another one has gone on with it"):
+        first.tell([expert(*query.trajectories) for query in queries])
+    assert contents(tmp_path / "run") == kept
+    assert fingerprint(second.run(expert)) == straight
+    assert fingerprint(bayespbrl.load(tmp_path / "run").learner) == straight
+
+
 def test_undo_works_on_disk_across_iterations_and_the_same_answers_lead_to_the_same_run(copy, straight):
     for undone in (1, 2, 3, 4):
         learner = runs.resume(copy)
