@@ -70,6 +70,14 @@ def test_contradictory_answers_leave_a_proper_gaussian():
         np.testing.assert_allclose(fit.mean, 0, atol=1e-6)
 
 
+def test_answers_that_contradict_each_other_about_the_same_margin_do_not_run_away():
+    # 5 for and 3 against a margin, beside one about another: the steps alone, which have no scale, decide
+    loadings = np.array([[0.01, 0.0]] * 5 + [[-0.01, 0.0]] * 3 + [[0.3, 0.9]])
+    fit = expectation_propagation(loadings, Mixed(5.0, 26.0).probit_mixture(), prior_scale=1.0)
+    assert fit.converged
+    assert np.all(np.linalg.eigvalsh(fit.covariance) > 0.1)
+
+
 def test_no_answers_leave_the_prior():
     fit = expectation_propagation(np.zeros((0, 2)), Mixed(5.0, 1.0).probit_mixture(), prior_scale=3.0)
     np.testing.assert_allclose(fit.covariance, 9 * np.eye(2))

@@ -46,6 +46,24 @@ def test_low_rank_keeps_zero_rows_at_zero_and_small_rows_at_their_size():
     np.testing.assert_allclose(factors.loadings[3] @ factors.basis.T, differences[3], rtol=1e-9)
 
 
+@pytest.mark.parametrize("number", [9, 26])
+def test_answers_that_contradict_each_other_about_the_same_margin_are_sampled_exactly(number):
+    # 5 for and 3 against a margin, beside one about another: the steps of eq. 8, which have no scale, decide; with
+    # K = 26 expectation propagation would follow them to infinite precision
+    differences = np.array([[0.01, 0.0]] * 5 + [[-0.01, 0.0]] * 3 + [[0.3, 0.9]])
+    grid = np.linspace(-6, 6, 601) + 0.005
+    w = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+    with jax.enable_x64(True):
+        log_likelihood = np.asarray(log_prob(Mixed(5.0, number), w @ differences.T)).sum(axis=1)
+    density = np.exp(log_likelihood - log_likelihood.max() - 0.5 * np.sum(w**2, axis=1))
+    mean = density @ w / density.sum()
+    tree = sample_posterior(differences, number_of_preferences=number, num_samples=2000, seed=1)
+    margins = tree["posterior/margins"].values
+    assert tree.attrs["converged"]
+    error = convergence(margins).monte_carlo_error
+    assert np.all(np.abs(margins.mean(axis=(0, 1)) - differences @ mean) < 4 * error)
+
+
 def test_no_preferences_give_the_prior():
     tree = sample_posterior(np.zeros((0, 3)), prior_scale=2.0, num_samples=500)
     w = tree["posterior/utility_weights"].values

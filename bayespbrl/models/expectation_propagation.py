@@ -11,6 +11,12 @@ from scipy.special import log_ndtr
 
 from bayespbrl.models.likelihoods import ProbitMixture
 
+# Prior variance of a margin over that of its site, beyond which the site is taken for a runaway. A step has no scale:
+# answers that contradict each other about the same margin (the same trajectories compared twice, say) each cut a part off
+# whatever the others leave, and their sites grow by a factor at every sweep, until the linear algebra breaks down near
+# 1e16. Sites that settle stay far below: 1e5 with 320 random answers about nearly the same margins.
+RUNAWAY = 1e12
+
 
 @dataclass(frozen=True)
 class GaussianApproximation:
@@ -19,7 +25,8 @@ class GaussianApproximation:
     Attributes:
       mean: shape (r,).
       covariance: shape (r, r).
-      site_precisions, site_shifts: the factors exp(−τ t²/2 + ν t) that stand for the answers, shapes (K,).
+      site_precisions, site_shifts: the factors exp(−τ t²/2 + ν t) that stand for the answers, shapes (K,); zero where
+        there is none, because the answer is contradicted by others about the same margin.
       log_evidence: expectation propagation's log ∫ p(answers | z) p(z) dz.
       sweeps: updates of all factors that were done.
       converged: whether the last update changed the margins' means and standard deviations by less than the tolerance.
@@ -77,8 +84,9 @@ def expectation_propagation(
     """
     number = len(loadings)
     precisions, shifts = np.zeros(number), np.zeros(number)
-    gaussian = _moments(loadings, precisions, shifts, prior_scale)
-    converged, sweeps, last = False, 0, np.inf
+    gaussian = prior = _moments(loadings, precisions, shifts, prior_scale)
+    converged, sweeps, last, first_damping = False, 0, np.inf, damping
+    held = np.zeros(number, dtype=bool)
     while sweeps < max_sweeps and not converged and number:
         sweeps += 1
         _, _, t_mean, t_variance, _ = gaussian
@@ -89,6 +97,13 @@ def expectation_propagation(
         # a violated answer's factor can widen its margin: its precision is held at 0, its shift keeps the tilted mean
         new_precisions = np.maximum(1 / variance - 1 / cavity_variance, 0.0)
         new_shifts = mean * (new_precisions + 1 / cavity_variance) - cavity_mean / cavity_variance
+        narrowed = new_precisions * prior[3]
+        if np.any(narrowed[~held] > RUNAWAY):
+            held |= narrowed > 0.01 * RUNAWAY
+            precisions, shifts, gaussian = np.zeros(number), np.zeros(number), prior
+            damping, last = first_damping, np.inf
+            continue
+        new_precisions[held] = new_shifts[held] = 0.0
         precisions = precisions + damping * (new_precisions - precisions)
         shifts = shifts + damping * (new_shifts - shifts)
         gaussian = _moments(loadings, precisions, shifts, prior_scale)
