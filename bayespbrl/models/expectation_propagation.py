@@ -12,9 +12,9 @@ from scipy.special import log_ndtr
 from bayespbrl.models.likelihoods import ProbitMixture
 
 # Prior variance of a margin over that of its site, beyond which the site is taken for a runaway. A step has no scale:
-# answers that contradict each other about the same margin (the same trajectories compared twice, say) each cut a part off
-# whatever the others leave, and their sites grow by a factor at every sweep, until the linear algebra breaks down near
-# 1e16. Sites that settle stay far below: 1e5 with 320 random answers about nearly the same margins.
+# answers that contradict each other about the same margin (the same trajectories compared twice, say) each cut a part
+# off whatever the others leave, and their sites grow by a factor at every sweep, until the linear algebra breaks down
+# near 1e16. Sites that settle stay far below: 1e5 with 320 random answers about nearly the same margins.
 RUNAWAY = 1e12
 
 
