@@ -137,14 +137,13 @@ class RunDirectory:
 
     def drop_partial_line(self) -> None:
         """Cut off a last line that a killed process left half-written, so that the next event starts a new one."""
-        self._end = 0
         file = self.path / "events.jsonl"
         if file.exists():
             whole = file.read_bytes()
             complete = whole[: whole.rfind(b"\n") + 1]
-            self._end = len(complete)
             if complete != whole:
                 os.truncate(file, len(complete))
+        self._end = self._log_size()
 
     def _log_size(self) -> int:
         file = self.path / "events.jsonl"
