@@ -205,7 +205,7 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
             site_precisions=1 + np.arange(6.0),
         )
         kernel = posterior.EllipticalSlice(low_rank_model)
-        z = np.random.default_rng(0).standard_normal((20, 8))
+        z = np.random.default_rng(0).standard_normal((20, len(problem.centre)))
         joint = np.array([sum(kernel._log_probs({"utility_weights": x}, (problem,), {})) for x in z])
         likelihood = np.array([kernel._log_probs({"utility_weights": x}, (problem,), {})[1] for x in z])
         (reference, _), (prior, _) = _ellipses((problem,), {})

@@ -27,6 +27,10 @@ from bayespbrl.policies.samples import WeightedSamples, weighted_samples
 from bayespbrl.policies.spaces import centre_and_range, dimension
 from bayespbrl.policies.sparse_regression import fit_sparse_regression, inducing_rows
 
+# From the last iteration's hyper-parameters 90 evaluations end within 0.005 nats a sample of 240 in the mean (Bicycle
+# and SwingUp, seed 100), which is less than the subsample itself decides.
+FIRST_EVALUATIONS, LATER_EVALUATIONS = 240, 90
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
@@ -171,7 +175,7 @@ class GaussianProcessPolicy:
         rng: np.random.Generator,
         base_weights: np.ndarray | None = None,
         hyperparameters: Literal["held-out", "training-error", "keep"] = "held-out",
-        evaluations: int = 240,
+        evaluations: int | None = None,
     ) -> Self:
         """Condition the prior on samples with noise σ²/wᵢ, new inducing points and, unless kept, hyper-parameters.
 
@@ -182,7 +186,8 @@ class GaussianProcessPolicy:
           sample_weights, base_weights: wᵢ = pᵢ/Wᵢ and Wᵢ, shape (N,); see `Policy.fit`.
           hyperparameters: objective of the CMA-ES search ("training-error" is the paper's); "keep" keeps the old ones,
             and takes the median rule's bandwidths if there are none yet.
-          evaluations: of the objective, for each action dimension.
+          evaluations: of the objective, for each action dimension; None for `FIRST_EVALUATIONS` in the first fit and
+            `LATER_EVALUATIONS` in those that begin where the last one ended.
         """
         if hyperparameters not in ("held-out", "training-error", "keep"):
             raise ValueError(
@@ -198,6 +203,8 @@ class GaussianProcessPolicy:
             action_dimension=number,
         )
         rule = median_bandwidths(samples.observations, period=self.period, rng=rng)
+        if evaluations is None:
+            evaluations = LATER_EVALUATIONS if int(self.fits) else FIRST_EVALUATIONS
         new: dict[str, list] = {name: [] for name in _FITTED}
         for output in range(number):
             for name, value in self._fit_output(output, samples, rule, rng, hyperparameters, evaluations).items():

@@ -72,7 +72,7 @@ def search(
     rng: np.random.Generator,
     objective: Objective = "held-out",
     step_size: float = 0.5,
-    evaluations: int = 240,
+    evaluations: int,
     subsample: int = 800,
     inducing_points: int = 50,
 ) -> SearchResult:
