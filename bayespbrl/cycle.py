@@ -18,7 +18,7 @@ from bayespbrl.settings import Settings, settings_for
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE = range(7)
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED = range(8)
 # Posterior draws that a rule for questions looks at: enough to order ten candidates, in hundredths of a second.
 QUERY_DRAWS = 500
 # And a schedule, for which every draw costs a column of LSTD: the spread of a gain is known within a tenth of itself.
@@ -313,7 +313,7 @@ class Learner:
             discount=settings.discount,
             fixed_point_ridge=settings.fixed_point_ridge,
             projection_ridge=settings.projection_ridge,
-            visited=self._recent_states(),
+            visited=self._visited_states(),
             utility_draws=utility_draws,
         )
         return improved, bounds[-1]
@@ -339,11 +339,17 @@ class Learner:
         draws = estimate.draws(features, number=SCHEDULE_DRAWS).reshape(-1, len(steps)).T
         return features @ estimate.weights, draws
 
-    def _recent_states(self) -> np.ndarray:
-        """The states in which the last iterations acted: those of the policy update."""
+    def _visited_states(self) -> np.ndarray:
+        """States in which the last iterations acted: those of the policy update, and no more than the settings say."""
         recent, size = self.settings.recent_iterations, self.settings.trajectories_per_iteration
         trajectories = self.state.trajectories if recent is None else self.state.trajectories[-recent * size :]
-        return np.concatenate([trajectory.states[:-1] for trajectory in trajectories])
+        states = np.concatenate([trajectory.states[:-1] for trajectory in trajectories])
+        if states.ndim == 1 or len(states) <= self.settings.update_states:
+            return states  # discrete ones are counted, not repeated
+        chosen = self._rng(VISITED, self.state.iteration).choice(
+            len(states), self.settings.update_states, replace=False
+        )
+        return states[np.sort(chosen)]
 
     def _state_features(
         self, rng: np.random.Generator, *, bandwidth_factor: float, normalised: bool = False

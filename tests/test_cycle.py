@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from bayespbrl import Answer, Learner, ReturnExpert, queries, rollouts
+from bayespbrl import Answer, Learner, ReturnExpert, improvement, queries, rollouts
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 
@@ -447,6 +447,31 @@ def compilations_after(run, iteration):
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     return len(count)
+
+
+def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch):
+    seen = []
+    real = improvement.improve
+
+    def improve(*args, visited, **options):
+        seen.append(visited)
+        return real(*args, visited=visited, **options)
+
+    monkeypatch.setattr(improvement, "improve", improve)
+    options = {"iterations": 3, "max_steps": 12, "centres": 20, "evaluation_episodes": 2, "utility": "known-reward"}
+    run = Learner("swing-up", seed=3, update_states=150, recent_iterations=2, **options).run(ReturnExpert())
+    acted = [{tuple(state) for state in trajectory.states[:-1]} for trajectory in run.trajectories]
+    assert [len(states) for states in seen] == [120, 150, 150]
+    recent = set().union(*acted[10:])  # of the two last iterations' 240
+    assert {tuple(state) for state in seen[2]} < recent and not {tuple(state) for state in seen[2]} <= acted[29]
+    assert len(np.unique(seen[2], axis=0)) == 150
+    again = Learner("swing-up", seed=3, update_states=150, recent_iterations=2, **options).run(ReturnExpert())
+    assert fingerprint(again) == fingerprint(run)
+    seen.clear()
+    Learner("gridworld", iterations=1, seed=3, update_states=150, max_steps=20, evaluation_episodes=2).run(
+        ReturnExpert()
+    )
+    assert [states.shape for states in seen] == [(200,)]  # discrete ones are counted, so that all are taken
 
 
 def test_compilations_do_not_grow_with_the_iterations():

@@ -33,6 +33,7 @@ BAD = {
     "first_queries": [0, 10, 1.5],
     "evaluation_episodes": [0, NAN],
     "centres": [0, -300, 1.5],
+    "update_states": [0, -1, 2.5],
     "max_steps": [0, -1, True, 10.0],
     "recent_iterations": [0, -4, True, 2.0],
     "exploration_hold": [0, -1, True, 2.0, None],
