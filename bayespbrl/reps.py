@@ -224,7 +224,7 @@ def _solve_dual(
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
         "ipopt.hessian_approximation": "limited-memory",
-        "ipopt.limited_memory_max_history": 20,
+        "ipopt.limited_memory_max_history": 6,  # 20 need as many iterations, and each costs more
         "ipopt.tol": 1e-8,
         "ipopt.max_iter": ITERATIONS,
     }

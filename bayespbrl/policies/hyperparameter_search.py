@@ -131,9 +131,11 @@ def _cost(
     points = coordinates(observations, period)
     scale = inverse_bandwidths(start.bandwidths, period)
     inducing = points[inducing_rows(points * scale, weights, number, rng=rng)]
-    half = rng.permutation(len(targets)) < len(targets) // 2
-    both = np.ones_like(half)
-    folds = [(half, ~half), (~half, half)] if objective == "held-out" and half.any() else [(both, both)]
+    order, middle = rng.permutation(len(targets)), len(targets) // 2
+    points, targets, weights = points[order], targets[order], weights[order]  # so that a fold is a view
+    folds = [(slice(middle), slice(middle, None)), (slice(middle, None), slice(middle))]
+    if objective == "training-error" or not middle:
+        folds = [(slice(None), slice(None))]
 
     def cost(logarithms: np.ndarray) -> float:
         parameters = start.replaced(logarithms)
@@ -161,8 +163,8 @@ def _predict(
     whitened: np.ndarray,
     targets: np.ndarray,
     weights: np.ndarray,
-    train: np.ndarray,
-    test: np.ndarray,
+    train: slice,
+    test: slice,
     parameters: Hyperparameters,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Predictive mean and variance of the samples `test` from the samples `train`."""
