@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
@@ -189,7 +190,9 @@ def _in_parallel(seeds: _Seeds, jobs: int, progress: Callable[[int], None] | Non
     running: dict[Future[bool], int] = {}
     with (
         _environment(ONE_THREAD if jobs > 1 else {}),
-        ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
+        ProcessPoolExecutor(
+            jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_the_study
+        ) as pool,
     ):
         started: set[int] = set()
         while True:
@@ -209,6 +212,18 @@ def _in_parallel(seeds: _Seeds, jobs: int, progress: Callable[[int], None] | Non
                     progress(seed)
     if failures:
         raise ValueError(f"{len(failures)} of {seeds.trials} trials failed; the first: {failures[0]}")
+
+
+def _end_with_the_study() -> None:
+    """In a trial's process: end when the study's does, be it killed, so that nobody goes on writing for it."""
+    study = multiprocessing.parent_process()
+
+    def wait_for_it() -> None:
+        if study is not None:
+            study.join()
+            os._exit(1)
+
+    threading.Thread(target=wait_for_it, daemon=True).start()
 
 
 def _trial(study: _Study, seed: int) -> bool:

@@ -1,6 +1,9 @@
 import csv
 import json
 import shutil
+import subprocess
+import sys
+import time
 from types import SimpleNamespace
 
 import jax
@@ -8,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayespbrl import load
+from bayespbrl import load, runs
 from bayespbrl import trials as trials_module
 from bayespbrl.rollouts import returns
 from bayespbrl.trial_tables import COLUMNS, collect
@@ -195,3 +198,24 @@ def test_bad_input_is_named_and_nothing_is_left(tmp_path, changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         run_trials("gridworld", tmp_path / "study", **({"trials": 1} | changes))
     assert not (tmp_path / "study").exists()
+
+
+@pytest.mark.slow
+def test_a_study_that_is_killed_takes_its_trials_with_it(tmp_path):
+    command = [sys.executable, "-m", "bayespbrl", "trials", "gridworld", "--utility", "linear-program"]
+    options = ["--iterations", "100000", "--trials", "2", "--jobs", "2", "--out", str(tmp_path / "study")]
+    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as study:
+        try:
+            logs = [tmp_path / "study" / f"seed-{seed}" / "events.jsonl" for seed in (1000, 1001)]
+            waited = time.monotonic() + 120
+            while not all(log.exists() and log.stat().st_size for log in logs):
+                assert time.monotonic() < waited
+                assert study.poll() is None
+                time.sleep(0.1)
+        finally:
+            study.kill()
+        study.communicate(timeout=60)  # their end of the pipe is closed: they have ended
+    lengths = [log.stat().st_size for log in logs]
+    time.sleep(1.0)
+    assert [log.stat().st_size for log in logs] == lengths
+    assert not runs.resume(tmp_path / "study" / "seed-1000").finished
