@@ -14,11 +14,11 @@ from bayespbrl.experts import Expert
 from bayespbrl.features import StateActionFeatures, checked_features, draw_state_action_features, draw_state_features
 from bayespbrl.policies.choice import initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
-from bayespbrl.settings import WIDER, Settings, settings_for
+from bayespbrl.settings import Settings, settings_for
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, WIDE = range(9)
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED = range(8)
 # Posterior draws that a rule for questions looks at: enough to order ten candidates, in hundredths of a second.
 QUERY_DRAWS = 500
 # And a schedule, for which every draw costs a column of LSTD: the spread of a gain is known within a tenth of itself.
@@ -72,11 +72,6 @@ class Learner:
                 self.environment.action_space,
                 action_scale=self.settings.initial_action_scale,
                 period=self._period,
-            )
-        if self.settings.wide_trajectories and not hasattr(own_policy, "widened"):
-            raise ValueError(
-                f"wide_trajectories: expected 0 with {type(own_policy).__name__}, which has no method `widened`, got "
-                f"{self.settings.wide_trajectories}"
             )
         self.state = events.replay(LearnerState(own_policy), entries)
 
@@ -183,7 +178,14 @@ class Learner:
         """Steps 3 and 4: new trajectories, and which of them to ask about."""
         state, settings = self.state, self.settings
         began = time.perf_counter()
-        collected = self._explored()
+        collected = rollouts.rollout(
+            self.environment,
+            state.policy,
+            key=self._key(COLLECT, state.iteration),
+            episodes=settings.trajectories_per_iteration,
+            max_steps=settings.max_steps,
+            hold=settings.exploration_hold,
+        )
         numbers = range(len(state.trajectories), len(state.trajectories) + len(collected))
         if state.estimate is None:
             wanted = settings.first_queries
@@ -199,24 +201,6 @@ class Learner:
             "seconds": time.perf_counter() - began,
         }
         self._record(event, trajectories=collected)
-
-    def _explored(self) -> tuple[Trajectory, ...]:
-        """New trajectories by the current policy, the last of them by a wider one where the settings ask for some."""
-        state, settings = self.state, self.settings
-        wide = settings.wide_trajectories if state.iteration else 0
-
-        def rollout(policy: Any, key: jax.Array, episodes: int) -> tuple[Trajectory, ...]:
-            return rollouts.rollout(
-                self.environment,
-                policy,
-                key=key,
-                episodes=episodes,
-                max_steps=settings.max_steps,
-                hold=settings.exploration_hold,
-            )
-
-        own = rollout(state.policy, self._key(COLLECT, state.iteration), settings.trajectories_per_iteration - wide)
-        return own + rollout(state.policy.widened(WIDER), self._key(WIDE, state.iteration), wide) if wide else own
 
     def _candidates(self, numbers: Sequence[int], collected: Sequence[Trajectory]) -> tuple[int, ...]:
         """The new trajectories in the order in which to ask about them."""

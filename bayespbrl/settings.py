@@ -13,7 +13,6 @@ POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process",
 FEATURES = ("drawn", "other")
 SCHEDULES = ("constant", "confidence", "other")
 HYPERPARAMETERS = ("evidence", "given")
-WIDER = 3.0  # standard deviations of the policy that collects the wide trajectories, in those of the policy itself
 
 
 @dataclass(frozen=True)
@@ -56,9 +55,6 @@ class Settings:
         continuous: what it costs, in seconds and memory, is then bounded however long the episodes are.
       exploration_hold: steps for which the exploring policy's random choice is held; 1 is the paper's. Noise drawn
         afresh at each step averages out and leaves the trajectories of an iteration alike. Evaluations never hold it.
-      wide_trajectories: from the second iteration on, so many of its trajectories are collected by a policy with the
-        same means and WIDER times the standard deviations. A policy narrows on whatever it found first, and then shows
-        trajectories that are all alike, about which an answer says little.
       initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
       fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂.
       expert, wrong_answers: who answers, and the share of a simulated expert's answers that are turned round; kept so
@@ -92,7 +88,6 @@ class Settings:
     recent_iterations: int | None = None
     update_states: int = 20_000
     exploration_hold: int = 1
-    wide_trajectories: int = 0
     initial_action_scale: float = 0.75
     fixed_point_ridge: float = 1e-8
     projection_ridge: float = 1e-8
@@ -133,7 +128,6 @@ class Settings:
         _whole("update_states", self.update_states, 1)
         _whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
         _whole("exploration_hold", self.exploration_hold, 1)
-        _whole("wide_trajectories", self.wide_trajectories, 0)
         _whole("seed", self.seed, 0)
         for name in ("max_steps", "recent_iterations"):
             if getattr(self, name) is not None:
@@ -141,7 +135,6 @@ class Settings:
         for name, limit in (
             ("queries_per_iteration", self.trajectories_per_iteration),
             ("first_queries", self.trajectories_per_iteration - 1),
-            ("wide_trajectories", self.trajectories_per_iteration - 1),
         ):
             if getattr(self, name) > limit:
                 raise ValueError(f"{name}: expected at most {limit} with {limit} candidates, got {getattr(self, name)}")

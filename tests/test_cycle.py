@@ -9,7 +9,6 @@ from gymnasium.spaces import Box, Discrete
 from bayespbrl import Answer, Learner, ReturnExpert, improvement, queries, rollouts
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
-from bayespbrl.settings import WIDER
 
 QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
 
@@ -471,26 +470,6 @@ def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch)
     seen.clear()
     learner(iterations=1, update_states=150).run(ReturnExpert())
     assert [states.shape for states in seen] == [(200,)]  # discrete ones are counted, so that all are taken
-
-
-def test_wide_trajectories_are_collected_by_a_wider_policy_from_the_second_iteration_on(monkeypatch):
-    collected = []
-    real = rollouts.rollout
-
-    def rollout(environment, policy, *, episodes, **options):
-        collected.append((policy, episodes))
-        return real(environment, policy, episodes=episodes, **options)
-
-    monkeypatch.setattr(rollouts, "rollout", rollout)
-    options = {"iterations": 2, "max_steps": 12, "centres": 20, "evaluation_episodes": 2, "utility": "linear-program"}
-    run = Learner("swing-up", seed=3, wide_trajectories=4, **options).run(ReturnExpert())
-    assert [episodes for _, episodes in collected] == [10, 6, 4]
-    (_, _), (narrow, _), (wide, _) = collected
-    states = run.trajectories[-1].states
-    np.testing.assert_allclose(wide.action_standard_deviation(states), WIDER * narrow.action_standard_deviation(states))
-    assert len(run.trajectories) == 20
-    with pytest.raises(ValueError, match=r"^wide_trajectories: expected 0 with TabularPolicy, .*, got 2$"):
-        learner(wide_trajectories=2)
 
 
 def test_compilations_do_not_grow_with_the_iterations():

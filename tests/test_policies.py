@@ -116,22 +116,6 @@ def test_sampled_actions_follow_log_prob(kind, fitted):
         np.testing.assert_allclose(actions.std(axis=0), deviation, rtol=0.03)
 
 
-@pytest.mark.parametrize("kind", ["linear", "diagonal", "process"])
-def test_a_widened_policy_has_the_same_means_and_wider_deviations(kind, fitted):
-    observations = some_observations(kind, 20, np.random.default_rng(12))
-    wide = fitted.widened(3.0)
-    np.testing.assert_allclose(
-        wide.action_standard_deviation(observations), 3 * fitted.action_standard_deviation(observations)
-    )
-    np.testing.assert_allclose(entropies(wide, observations) - entropies(fitted, observations), 2 * np.log(3.0))
-    key = jax.random.key(6)  # the same draws, three times as far from the same means
-    near, far = (sample_actions(policy, key, observations) for policy in (fitted, wide))
-    middle = near + (near - far) / 2
-    np.testing.assert_allclose(
-        sample_actions(fitted.widened(2.0), key, observations) - middle, 2 * (near - middle), atol=1e-9
-    )
-
-
 def test_a_row_depends_on_the_key_and_its_number_alone(kind, fitted):
     observations = some_observations(kind, batch.CHUNK + 10, np.random.default_rng(4))
     many = sample_actions(fitted, jax.random.key(2), observations)

@@ -34,7 +34,6 @@ BAD = {
     "evaluation_episodes": [0, NAN],
     "centres": [0, -300, 1.5],
     "update_states": [0, -1, 2.5],
-    "wide_trajectories": [-1, 10, 2.5],
     "max_steps": [0, -1, True, 10.0],
     "recent_iterations": [0, -4, True, 2.0],
     "exploration_hold": [0, -1, True, 2.0, None],

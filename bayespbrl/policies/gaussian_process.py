@@ -157,11 +157,6 @@ class GaussianProcessPolicy:
         """Standard deviation of the action at each observation, in the action's units; shape (N, A)."""
         return np.sqrt(self.mean_and_variance(observations)[1])
 
-    def widened(self, factor: float) -> Self:
-        """The same means, and standard deviations `factor` times as large."""
-        square = factor**2
-        return replace(self, signal_variance=square * self.signal_variance, noise_variance=square * self.noise_variance)
-
     def kl_divergence(self, old: Self, observations: np.ndarray) -> np.ndarray:
         """KL(self ‖ old) of the two normal distributions at each observation, shape (N,)."""
         mean, variance = self.mean_and_variance(observations)

@@ -97,10 +97,6 @@ class LinearGaussianPolicy:
         deviation = np.sqrt(np.square(np.asarray(self.factor)).sum(axis=1))
         return np.tile(deviation, (len(observations), 1))
 
-    def widened(self, factor: float) -> Self:
-        """The same means, and standard deviations `factor` times as large."""
-        return replace(self, factor=factor * self.factor)
-
     def kl_divergence(self, old: Self, observations: np.ndarray) -> np.ndarray:
         """KL(self ‖ old) of the two normal distributions at each observation, shape (N,)."""
         new_factor, old_factor = np.asarray(self.factor), np.asarray(old.factor)

@@ -14,8 +14,7 @@ class Policy(Protocol):
     The methods that take a single observation are JAX-traceable, so that a rollout compiled once takes any policy of
     the same type as an argument (`batch` maps them over N observations); the others take and return NumPy arrays.
     Policies over discrete actions also have `probabilities(observations) -> (N, A)`, those over continuous actions
-    `action_standard_deviation(observations) -> (N, A)`, and `widened(factor)`, the same means with standard deviations
-    so many times as large, for runs with `wide_trajectories`.
+    `action_standard_deviation(observations) -> (N, A)`.
     """
 
     @classmethod
