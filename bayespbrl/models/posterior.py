@@ -28,10 +28,11 @@ from bayespbrl.models.preference_model import (
 # Share of each answer's Gaussian factor that enters the reference: with all of it the reference is as narrow as the
 # posterior's bulk and its residual has no bound in the tails; towards none it is the prior, which mixes badly.
 REFERENCE_POWER = 0.5
-# Moves round the reference's and the prior's ellipses per recorded draw. Of 8000 draws, 30 and 2 leave 1396, 509, 648
-# effective ones on three posteriors of the Bicycle's (seed 0), 24 and 8 leave 2115, 1754, 748; on the Gridworld's and
-# the swing-up's differences 2520 and 4846 against 2469 and 4761; with 8 and 24 the swing-up's fall to 2131.
-REFERENCE_MOVES, PRIOR_MOVES = 24, 8
+# Moves round the reference's and the prior's ellipses per recorded draw. Draws a chain until convergence, mean of 24
+# seeds, on the Gridworld's and the swing-up's differences: 698 and 375 with 30 and 2, 583 and 333 with 26 and 6, 708
+# and 385 with 24 and 8. Effective draws of 4000 on three harder posteriors of the Bicycle's (seed 101): 260, 404, 150
+# with 30 and 2, 1238, 1305, 231 with 26 and 6.
+REFERENCE_MOVES, PRIOR_MOVES = 26, 6
 # Draws that one call of the compiled sampler makes; its length is part of what is compiled.
 CHUNK = 25
 
