@@ -479,7 +479,12 @@ def test_compilations_do_not_grow_with_the_iterations():
 
 @pytest.mark.slow
 def test_compilations_of_the_sampler_grow_with_its_capacity_only():
-    # 2 to 9 preferences cross at most one power of two after the third iteration
+    # 9 answers an iteration: the fourth takes them beyond 32, the first capacity
+    many = {"utility": "posterior-mean", "iterations": 5, "first_queries": 9, "queries_per_iteration": 9}
+    run = learner(**many)
+    assert 0 < compilations_after(run, 3) <= 8
+    assert len(run.preferences.pairs) > 32
+    assert compilations_after(learner(**many), 0) == 0
     assert compilations_after(learner(utility="posterior-mean", iterations=8), 3) <= 8
     assert compilations_after(learner(utility="posterior-mean", iterations=8), 0) == 0
 

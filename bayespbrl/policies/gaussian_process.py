@@ -203,8 +203,6 @@ class GaussianProcessPolicy:
             action_dimension=number,
         )
         rule = median_bandwidths(samples.observations, period=self.period, rng=rng)
-        if evaluations is None:
-            evaluations = LATER_EVALUATIONS if int(self.fits) else FIRST_EVALUATIONS
         new: dict[str, list] = {name: [] for name in _FITTED}
         for output in range(number):
             for name, value in self._fit_output(output, samples, rule, rng, hyperparameters, evaluations).items():
@@ -219,7 +217,7 @@ class GaussianProcessPolicy:
         rule: np.ndarray,
         rng: np.random.Generator,
         hyperparameters: str,
-        evaluations: int,
+        evaluations: int | None,
     ) -> dict[str, Any]:
         """The arrays of `_FITTED` for one action dimension; `rule` are the median rule's bandwidths."""
         targets = samples.actions[:, output] - self.action_centre[output]
@@ -229,17 +227,20 @@ class GaussianProcessPolicy:
             floor = float(np.square(self.minimum_noise * self.action_range[output]))
             square = max(float(samples.weights @ np.square(targets) / samples.weights.sum()), floor)
             reference = Hyperparameters(rule, square, square)
+            later = int(self.fits) > 0
+            if evaluations is None:
+                evaluations = LATER_EVALUATIONS if later else FIRST_EVALUATIONS
             result = search(
                 samples.observations,
                 targets,
                 samples.weights,
-                start=parameters if int(self.fits) else Hyperparameters(rule, 0.5 * square, 0.5 * square),
+                start=parameters if later else Hyperparameters(rule, 0.5 * square, 0.5 * square),
                 reference=reference,
                 minimum_noise_variance=floor,
                 period=self.period,
                 rng=rng,
                 objective="held-out" if hyperparameters == "held-out" else "training-error",
-                step_size=0.3 if int(self.fits) else 0.7,
+                step_size=0.3 if later else 0.7,
                 evaluations=evaluations,
             )
             parameters, objective, at_bound = result.hyperparameters, result.objective, result.at_bound
