@@ -215,7 +215,6 @@ class Learner:
             draws[:, :-1],
             draws[:, -1],
             likelihood=state.estimate.likelihood,
-            scale=state.estimate.scale,
             rng=self._rng(CHOOSE, state.iteration),
         )
 

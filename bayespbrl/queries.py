@@ -39,7 +39,6 @@ def posterior_candidates(
     incumbent: np.ndarray,
     *,
     likelihood: Likelihood,
-    scale: float,
     rng: np.random.Generator,
 ) -> tuple[int, ...]:
     """`numbers` as a rule that looks at the posterior prefers them; equal ones by their mean utility.
@@ -53,8 +52,7 @@ def posterior_candidates(
       numbers: the n new trajectories.
       utilities: S posterior draws of the utility of each, shape (S, n).
       incumbent: the same draws of the utility of the best so far, shape (S,).
-      likelihood: of an answer given its margin.
-      scale: of the likelihood's margins: differences of utilities times `scale`.
+      likelihood: of an answer given its margin, the difference of the two utilities.
       rng: for `thompson`.
 
     Raises:
@@ -69,7 +67,7 @@ def posterior_candidates(
         case "thompson":
             scores = utilities[rng.integers(len(utilities))]
         case "information":
-            scores = expected_information(utilities, incumbent, likelihood=likelihood, scale=scale)
+            scores = expected_information(utilities, incumbent, likelihood=likelihood)
         case "disagreement":
             better = probability_better(utilities, incumbent)
             scores = better * (1 - better)
@@ -92,9 +90,7 @@ def probability_better(utilities: np.ndarray, incumbent: np.ndarray) -> np.ndarr
     return np.mean((1 + np.sign(utilities - incumbent[:, None])) / 2, axis=0)
 
 
-def expected_information(
-    utilities: np.ndarray, incumbent: np.ndarray, *, likelihood: Likelihood, scale: float = 1.0
-) -> np.ndarray:
+def expected_information(utilities: np.ndarray, incumbent: np.ndarray, *, likelihood: Likelihood) -> np.ndarray:
     """What the answer to "this one or the incumbent?" is expected to tell about the utility, in nats, ≤ log 2.
 
     The mutual information of answer and weights, H(E p) − E H(p), with p the likelihood of the one answer at each draw
@@ -103,8 +99,7 @@ def expected_information(
 
     Args:
       utilities, incumbent: posterior draws, shapes (S, n) and (S,).
-      likelihood: of an answer given its margin.
-      scale: of the likelihood's margins: differences of utilities times `scale`.
+      likelihood: of an answer given its margin, the difference of the two utilities.
 
     Returns:
       shape (n,).
@@ -114,7 +109,7 @@ def expected_information(
     """
     utilities, incumbent = _checked(utilities, incumbent)
     with jax.enable_x64(True):
-        p = np.exp(np.asarray(_log_prob(likelihood, scale * (utilities - incumbent[:, None]))))
+        p = np.exp(np.asarray(_log_prob(likelihood, utilities - incumbent[:, None])))
     # the estimate from the same draws is never negative but for rounding
     return np.maximum(_entropy(p.mean(axis=0)) - _entropy(p).mean(axis=0), 0.0)
 

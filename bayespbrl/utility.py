@@ -125,7 +125,7 @@ class LinearUtility:
 
     @property
     def likelihood(self) -> Likelihood:
-        """Of the next answer, as a function of a difference of utilities times `scale`; needs a posterior."""
+        """Of the next answer, as a function of the difference of two utilities wᵀψ; needs a posterior."""
         if self.posterior is None:
             raise ValueError("likelihood: expected an estimate with a posterior, got one without")
         options = {name: self.posterior.attrs[name] for name in ("steepness", "lapse_rate")}

@@ -116,8 +116,8 @@ def test_the_rules_ask_about_the_trajectory_whose_score_is_highest():
                 new, (question,) = run.trajectories[-10:], questions
                 draws = run.estimate.trajectory_draws([*new, run.trajectories[question.incumbent]], number=500)
                 if score is None:
-                    options = {"likelihood": run.estimate.likelihood, "scale": run.estimate.scale}
-                    scores = queries.expected_information(draws[:, :-1], draws[:, -1], **options)
+                    likelihood = run.estimate.likelihood
+                    scores = queries.expected_information(draws[:, :-1], draws[:, -1], likelihood=likelihood)
                 else:
                     scores = score(draws[:, :-1], draws[:, -1])
                 assert scores[question.newcomer % 10] == scores.max()

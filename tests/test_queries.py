@@ -55,7 +55,7 @@ def test_a_question_names_the_two_and_holds_them_in_the_order_shown():
         assert query.number == number
 
 
-COIN = {"likelihood": Logistic(1.0), "scale": 1.0, "rng": np.random.default_rng(0)}
+COIN = {"likelihood": Logistic(1.0), "rng": np.random.default_rng(0)}
 # Four draws of three newcomers; the incumbent is 0 in each. Better in 1, 3 and 2 of the four draws; the mean is highest
 # for the first, which is far better in one draw.
 DRAWS = np.array([[9.0, 1.0, 2.0], [-1.0, 1.0, 2.0], [-1.0, 1.0, -2.0], [-1.0, -1.0, -2.0]])
@@ -84,7 +84,7 @@ def test_candidates_that_the_rule_cannot_tell_apart_come_by_their_mean_then_in_t
     for rule in ("probably-better", "disagreement", "information"):
         likelihood = Mixed(1e9, 1e9)  # every answer is certain, so that none tells anything
         chosen = posterior_candidates(
-            rule, [4, 5, 6, 7], utilities, np.zeros(2), likelihood=likelihood, scale=1.0, rng=np.random.default_rng(0)
+            rule, [4, 5, 6, 7], utilities, np.zeros(2), likelihood=likelihood, rng=np.random.default_rng(0)
         )
         assert chosen == (5, 7, 6, 4)
 
@@ -92,8 +92,7 @@ def test_candidates_that_the_rule_cannot_tell_apart_come_by_their_mean_then_in_t
 def test_thompson_ranks_by_one_draw_and_picks_each_draw_as_often():
     rng = np.random.default_rng(2)
     drawn = [
-        posterior_candidates("thompson", [7, 8, 9], DRAWS, ZERO, likelihood=Logistic(1.0), scale=1.0, rng=rng)
-        for _ in range(2000)
+        posterior_candidates("thompson", [7, 8, 9], DRAWS, ZERO, likelihood=Logistic(1.0), rng=rng) for _ in range(2000)
     ]
     orders = [
         (7, 9, 8),
@@ -108,10 +107,7 @@ def test_thompson_ranks_by_one_draw_and_picks_each_draw_as_often():
 
 def test_thompson_is_chosen_by_its_stream():
     rankings = [
-        [
-            posterior_candidates("thompson", [7, 8, 9], DRAWS, ZERO, likelihood=None, scale=1.0, rng=rng)
-            for _ in range(20)
-        ]
+        [posterior_candidates("thompson", [7, 8, 9], DRAWS, ZERO, likelihood=None, rng=rng) for _ in range(20)]
         for rng in (np.random.default_rng(5), np.random.default_rng(5), np.random.default_rng(6))
     ]
     assert rankings[0] == rankings[1]
@@ -128,14 +124,14 @@ def test_expected_information_of_certain_answers_is_the_entropy_of_the_order():
 def test_expected_information_matches_the_mutual_information_of_the_joint_table():
     rng = np.random.default_rng(4)
     utilities, incumbent = rng.normal(size=(50, 3)), rng.normal(size=50)
-    scale, steepness = 0.7, 2.0
-    p = 1 / (1 + np.exp(-steepness * scale * (utilities - incumbent[:, None])))
+    steepness = 1.4
+    p = 1 / (1 + np.exp(-steepness * (utilities - incumbent[:, None])))
     expected = []
     for column in p.T:
         joint = np.column_stack([column, 1 - column]) / 50  # (draw, answer)
         independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0)
         expected.append(np.sum(joint * np.log(joint / independent)))
-    information = expected_information(utilities, incumbent, likelihood=Logistic(steepness), scale=scale)
+    information = expected_information(utilities, incumbent, likelihood=Logistic(steepness))
     np.testing.assert_allclose(information, expected, rtol=1e-10)
 
 
@@ -164,9 +160,7 @@ def test_information_prefers_what_the_posterior_is_unsure_of_over_what_the_exper
     # second is far better or far worse: its answer tells which.
     utilities = np.column_stack([np.zeros(100), np.repeat([-3.0, 3.0], 50)])
     for rule in ("information", "disagreement"):
-        order = posterior_candidates(
-            rule, [0, 1], utilities + 1.0, np.ones(100), likelihood=Logistic(5.0), scale=1.0, rng=None
-        )
+        order = posterior_candidates(rule, [0, 1], utilities + 1.0, np.ones(100), likelihood=Logistic(5.0), rng=None)
         assert order == ((1, 0) if rule == "information" else (0, 1))  # to the order alone both are even matches
 
 

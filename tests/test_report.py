@@ -171,6 +171,9 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(f
     expected = answer_probabilities(parts["estimate"].posterior, difference)[0, 0 if said == "first" else 1]
     assert float(table["before"][3]) == pytest.approx(expected)
     assert float(table["probability"][3]) == pytest.approx(likelihood[-1])
+    utilities = run.estimate.trajectory_utilities(both)
+    margin = (utilities[0] - utilities[1]) * (1 if said == "first" else -1)
+    assert float(table["margin"][3]) == pytest.approx(margin, rel=1e-6)  # in the units of the utility
 
 
 def test_the_most_surprising_answer_comes_first_and_ties_last():

@@ -3,13 +3,14 @@
 import itertools
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 import scipy.optimize
 
 from bayespbrl import utility
 from bayespbrl.features import OneHot, RadialBasis
-from bayespbrl.models.likelihoods import Logistic, Mixed, WithLapses
+from bayespbrl.models.likelihoods import Logistic, Mixed, WithLapses, log_prob
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
 from bayespbrl.utility import KnownReward, choose_hyperparameters, estimate_utility
 
@@ -161,6 +162,19 @@ def test_the_likelihood_of_the_next_answer_is_that_of_the_fit():
         fit = estimate.posterior.copy()
         fit.attrs |= options
         assert replace(estimate, posterior=fit).likelihood == expected
+
+
+def test_the_likelihood_takes_differences_of_utilities_as_they_are():
+    def twenty_fold(states):
+        return 20 * ONE_HOT(states)
+
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, twenty_fold, method="posterior-mean", discount=0.9)
+    assert estimate.scale > 20
+    draws = estimate.draws(trajectory_features(TRAJECTORIES, twenty_fold, discount=0.9))
+    margins = np.stack([draws[..., i] - draws[..., j] for i, j in PAIRS], axis=-1)
+    with jax.enable_x64(True):
+        answers = log_prob(estimate.likelihood, margins)
+    np.testing.assert_allclose(answers, estimate.posterior["log_likelihood"]["answers"], atol=1e-10)
 
 
 def test_without_a_posterior_there_are_no_draws_and_no_likelihood():

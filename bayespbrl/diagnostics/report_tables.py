@@ -78,8 +78,7 @@ def answers_table(evidence: Evidence) -> xr.Dataset:
             margins = np.asarray(tree["posterior"]["margins"])[:, :, record.row]
             log_likelihood = np.asarray(tree["log_likelihood"]["answers"])[:, :, record.row]
             columns["probability"][k] = np.mean(np.exp(log_likelihood))
-            scale = evidence.estimate.scale
-            columns["margin"][k], columns["margin_sd"][k] = margins.mean() / scale, margins.std() / scale
+            columns["margin"][k], columns["margin_sd"][k] = margins.mean(), margins.std()
         else:
             columns["margin"][k] = _margin(evidence, record)
     data: dict[str, Any] = {name: [getattr(r, name) for r in records] for name in ("question", "iteration")}
