@@ -38,7 +38,10 @@ Likelihood = Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or
 PriorScale = Annotated[float | None, typer.Option(help="Prior standard deviation of a utility weight.")]
 Steepness = Annotated[float | None, typer.Option(help="Of the likelihood, in units of the largest difference.")]
 LapseRate = Annotated[float | None, typer.Option(help="Share of answers that the model takes for coin tosses.")]
-Discount = Annotated[float | None, typer.Option(help="Of features and rewards, in [0, 1); the paper's is 0.98.")]
+Discount = Annotated[float | None, typer.Option(help="Of Q, and of ψ(τ) unless told, in [0, 1); the paper's is 0.98.")]
+TrajectoryDiscount = Annotated[
+    float | None, typer.Option(help="Of ψ(τ), by which answers are explained, in [0, 1]; the paper's is that of Q.")
+]
 WrongAnswers = Annotated[float | None, typer.Option(help="Share of the simulated expert's answers turned round.")]
 PolicyKind = Annotated[
     str | None, typer.Option("--policy", help="auto, tabular, softmax, linear-gaussian or gaussian-process.")
@@ -62,6 +65,7 @@ def run(
     steepness: Steepness = None,
     lapse_rate: LapseRate = None,
     discount: Discount = None,
+    trajectory_discount: TrajectoryDiscount = None,
     wrong_answers: WrongAnswers = None,
     policy: PolicyKind = None,
     centres: Centres = None,
@@ -114,6 +118,7 @@ def trials(
     steepness: Steepness = None,
     lapse_rate: LapseRate = None,
     discount: Discount = None,
+    trajectory_discount: TrajectoryDiscount = None,
     wrong_answers: WrongAnswers = None,
     policy: PolicyKind = None,
     centres: Centres = None,

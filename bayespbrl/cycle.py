@@ -267,7 +267,8 @@ class Learner:
             normalised=settings.normalised_utility,
         )
         model: dict[str, Any] = {name: getattr(settings, name) for name in ("steepness", "lapse_rate")}
-        fixed: dict[str, Any] = {name: getattr(settings, name) for name in ("discount", "prior_scale", "likelihood")}
+        fixed: dict[str, Any] = {name: getattr(settings, name) for name in ("prior_scale", "likelihood")}
+        fixed["discount"] = settings.psi_discount
         choice = None
         if settings.hyperparameters == "evidence" and settings.utility != "known-reward":
             choice = utility.choose_hyperparameters(state.trajectories, pairs, features, **model, **fixed)

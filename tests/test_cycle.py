@@ -9,6 +9,7 @@ from gymnasium.spaces import Box, Discrete
 from bayespbrl import Answer, Learner, ReturnExpert, improvement, queries, rollouts
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
+from bayespbrl.trajectories import transitions
 
 QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
 
@@ -447,6 +448,23 @@ def compilations_after(run, iteration):
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     return len(count)
+
+
+def test_answers_have_a_discount_of_their_own(monkeypatch):
+    seen = []
+    real = improvement.improve
+
+    def improve(*args, discount, **options):
+        seen.append(discount)
+        return real(*args, discount=discount, **options)
+
+    monkeypatch.setattr(improvement, "improve", improve)
+    run = learner(iterations=1, discount=0.9, trajectory_discount=1.0).run(ReturnExpert())
+    assert seen == [0.9]
+    trajectory = run.trajectories[3]
+    whole = run.estimate.step_utilities(transitions([trajectory])).sum()
+    np.testing.assert_allclose(run.estimate.trajectory_utilities([trajectory]), [whole], rtol=1e-12)
+    assert learner(iterations=1, discount=0.9).run(ReturnExpert()).estimate.discount == 0.9
 
 
 def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch):

@@ -26,6 +26,7 @@ BAD = {
     "projection_ridge": [-1e-8, INFINITY],
     "lapse_rate": [-0.1, 1.0, NAN, True],
     "discount": [1.0, -0.5, NAN, "0.98"],
+    "trajectory_discount": [1.01, -0.5, NAN, "1", True],
     "wrong_answers": [-0.1, 1.1, NAN, True],
     "seed": [-1, 1.0, True, NAN, None],
     "trajectories_per_iteration": [0, 1, 2.5],
@@ -70,6 +71,7 @@ def test_the_defaults_are_the_papers_protocol():
     assert (settings.iterations, settings.trajectories_per_iteration) == (25, 10)
     assert Settings("any").discount == 0.98
     assert settings.discount == 0.995  # the one departure, argued beside the preset
+    assert settings.psi_discount == 0.995
     assert (settings.first_queries, settings.queries_per_iteration) == (2, 1)  # 26 answers in 25 iterations
     assert (settings.utility, settings.likelihood, settings.evaluation_episodes) == ("posterior-mean", "mixed", 100)
 

@@ -123,7 +123,8 @@ def _facts(evidence: Evidence) -> list[tuple[str, str]]:
         ("steepness m", f"{evidence.fitted_with('steepness'):g}"),
         ("lapse rate λ", f"{evidence.fitted_with('lapse_rate'):g}"),
         ("KL bound ε", f"{settings.kl_bound:g}"),
-        ("discount γ", f"{settings.discount:g}"),
+        ("discount γ of Q", f"{settings.discount:g}"),
+        ("discount γ of ψ", f"{settings.psi_discount:g}"),
         ("policy", settings.policy),
         ("expert", expert),
         *(
