@@ -24,13 +24,19 @@ Utility = Annotated[
 ]
 Query = Annotated[
     str | None,
-    typer.Option(help="highest-utility (the paper's), probably-better, thompson, information or disagreement."),
+    typer.Option(
+        help="highest-utility (the paper's), probably-better, thompson, information, disagreement or "
+        "information-when-unsure."
+    ),
 ]
 Schedule = Annotated[
     str | None, typer.Option(help="constant (the paper's), or confidence: the bound follows the posterior's certainty.")
 ]
 Hyperparameters = Annotated[
-    str | None, typer.Option(help="evidence: length scales, steepness and lapse rate by the answers; or given.")
+    str | None,
+    typer.Option(
+        help="evidence: length scales, steepness and lapse rate by the answers; averaged over them; or given."
+    ),
 ]
 Iterations = Annotated[int | None, typer.Option(help="Cycles of the four steps.")]
 KLBound = Annotated[float | None, typer.Option("--kl-bound", help="Bound on each policy update, in nats.")]

@@ -50,10 +50,11 @@ class LearnerState:
       trajectories: all of them, by number.
       preferences: the answers so far.
       collected: whether the next iteration's trajectories are among them.
-      candidates: new trajectories not asked about yet, best first.
+      candidates: trajectories to ask about in this iteration, best first.
       wanted: answers still wanted in this iteration.
       query: the question that waits for an answer.
       queries: questions put so far.
+      shown: the trajectories that some question showed.
       summaries: one for each completed iteration.
       previous: the state before the last answer.
     """
@@ -68,6 +69,7 @@ class LearnerState:
     wanted: int = 0
     query: Query | None = None
     queries: int = 0
+    shown: frozenset[int] = frozenset()
     summaries: tuple[Mapping[str, Any], ...] = ()
     previous: "LearnerState | None" = field(default=None, repr=False)
 
@@ -88,7 +90,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
                 raise ValueError(f"asked: expected trajectories below {len(state.trajectories)}, got {shown}")
             both = (state.trajectories[shown[0]], state.trajectories[shown[1]])
             query = Query(event["query"], *shown, event["newcomer"], both)
-            return replace(state, query=query, queries=event["query"])
+            return replace(state, query=query, queries=event["query"], shown=state.shown.union(shown))
         case "answered":
             return _answered(state, event)
         case "improved":

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import records
+from bayespbrl.averaging import AveragedUtility
 from bayespbrl.events import Entry
 from bayespbrl.models import restored, stored
 from bayespbrl.trajectories import Trajectory
@@ -102,11 +103,30 @@ def _estimate_groups(estimate: Any) -> dict[str, xr.DataTree]:
     except ValueError:
         data.attrs["features"] = "other"  # the user's function, which has to be passed again
     groups = {"utility": xr.DataTree(data, children=children)}
+    if isinstance(estimate, AveragedUtility):
+        groups["average"] = _average_group(estimate)
     if estimate.posterior is not None:
         small = stored(estimate.posterior)
         groups |= {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
         groups["fit"] = xr.DataTree(small.to_dataset())
     return groups
+
+
+AVERAGE = {
+    "multiples": ("component", "dimension"),
+    "probabilities": ("component",),
+    "means": ("component", "feature"),
+    "components": ("draw",),
+    "weight_draws": ("draw", "feature"),
+}
+
+
+def _average_group(estimate: AveragedUtility) -> xr.DataTree:
+    data = xr.Dataset({name: (dimensions, getattr(estimate, name)) for name, dimensions in AVERAGE.items()})
+    try:
+        return xr.DataTree(data, children={"base": records.to_tree(estimate.base)})
+    except ValueError:
+        return xr.DataTree(data)  # the user's function: the estimate's own
 
 
 def _read_estimate(tree: xr.DataTree, features: Any, known: Sequence[type]) -> Any:
@@ -122,7 +142,7 @@ def _read_estimate(tree: xr.DataTree, features: Any, known: Sequence[type]) -> A
         groups = {name: tree.children[name] for name in POSTERIOR_GROUPS if name in tree.children}
         posterior = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
     quality = records.from_tree(utility.children["quality"])
-    return LinearUtility(
+    estimate = LinearUtility(
         features,
         utility.dataset["weights"].values,
         float(utility.attrs["discount"]),
@@ -130,3 +150,9 @@ def _read_estimate(tree: xr.DataTree, features: Any, known: Sequence[type]) -> A
         posterior,
         float(utility.attrs["scale"]),
     )
+    if "average" not in tree.children:
+        return estimate
+    average = tree.children["average"]
+    base = records.from_tree(average.children["base"], known=known) if "base" in average.children else features
+    arrays = {name: average.dataset[name].values for name in AVERAGE}
+    return AveragedUtility(**vars(estimate), base=base, **arrays)

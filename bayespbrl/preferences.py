@@ -35,7 +35,7 @@ class Query:
     Attributes:
       number: counts the questions of a run from 1.
       first, second: the numbers of the two trajectories in the order shown, which is drawn at random.
-      newcomer: which of the two is the new trajectory; the other is the newest of the undominated.
+      newcomer: which of the two was not shown before; the other is the newest of the undominated.
       trajectories: the two themselves, in the order shown.
     """
 

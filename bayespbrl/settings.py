@@ -6,13 +6,13 @@ from typing import Any
 
 UTILITIES = ("posterior-mean", "most-likely", "posterior-draw", "linear-program", "known-reward")
 WITHOUT_POSTERIOR = ("linear-program", "known-reward")
-QUERIES = ("highest-utility", "probably-better", "thompson", "information", "disagreement")
+QUERIES = ("highest-utility", "probably-better", "thompson", "information", "disagreement", "information-when-unsure")
 LIKELIHOODS = ("mixed", "logistic", "probit")
 EXPERTS = ("return", "terminal", "other")
 POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
 FEATURES = ("drawn", "other")
 SCHEDULES = ("constant", "confidence", "other")
-HYPERPARAMETERS = ("evidence", "given")
+HYPERPARAMETERS = ("evidence", "given", "averaged")
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,16 @@ class Settings:
       steepness: m of the likelihood, for differences divided by their largest absolute entry.
       lapse_rate: λ, the probability that an answer is a coin toss, in [0, 1).
       hyperparameters: whether the utility's length scales, the steepness and the lapse rate are chosen each iteration
-        by the `evidence` of the answers, beginning at the given ones, or are the `given` ones.
+        by the `evidence` of the answers, beginning at the given ones, or are the `given` ones; `averaged` is over
+        length scales and steepness, each as likely as the evidence says.
       utility_bandwidth_factor: multiplies the median rule for the utility's features.
       normalised_utility: whether the utility's radial basis functions are divided by their sum. Decision: they are, so
         that "upright is good" goes on to upright states that no compared trajectory was in, where the plain functions
         of the paper fall to zero and hold the policy to what it knows.
       seed: of every random choice of the run.
       query: which of the new trajectories are asked about; `highest-utility` is the paper's rule, the others look at
-        the posterior.
+        the posterior. `information-when-unsure` is the paper's rule while the schedule `confidence` finds a signal of
+        0.6 or more; with less it asks for the most information about any trajectory that was never compared.
       trajectories_per_iteration: N.
       queries_per_iteration, first_queries: M, in later iterations and in the first.
       discount: γ.
@@ -109,6 +111,10 @@ class Settings:
         _one_of("features", self.features, FEATURES)
         _one_of("schedule", self.schedule, SCHEDULES)
         _one_of("hyperparameters", self.hyperparameters, HYPERPARAMETERS)
+        if self.query == "information-when-unsure" and self.schedule != "confidence":
+            raise ValueError(f"schedule: expected confidence with the query {self.query}, got {self.schedule!r}")
+        if self.hyperparameters == "averaged" and self.utility != "posterior-mean":
+            raise ValueError(f"utility: expected posterior-mean with averaged hyperparameters, got {self.utility!r}")
         for name in (
             "kl_bound",
             "prior_scale",

@@ -123,6 +123,10 @@ class LinearUtility:
         features = trajectory_features(trajectories, self.features, discount=self.discount)
         return self.draws(features, number=number).reshape(-1, len(trajectories))
 
+    def state_draws(self, states: np.ndarray, *, number: int | None = None) -> np.ndarray:
+        """Posterior draws of wᵀφ(s) of N states, all chains' in one, shape (S, N); `number` as of `draws`."""
+        return self.draws(self.features(states), number=number).reshape(-1, len(states))
+
     @property
     def likelihood(self) -> Likelihood:
         """Of the next answer, as a function of the difference of two utilities wᵀψ; needs a posterior."""
@@ -198,7 +202,7 @@ def choose_hyperparameters(
 
     Source: specification, section 8: the utility's length scale is chosen by evidence.
     """
-    shown, rows = _compared(trajectories, pairs)
+    shown, rows = compared(trajectories, pairs)
     dimensions = len(features.bandwidths) if isinstance(features, RadialBasis) else 0
     differences: dict[tuple[float, ...], np.ndarray] = {}
 
@@ -209,7 +213,7 @@ def choose_hyperparameters(
         multiples, (relative_steepness, lapses) = point[:dimensions], point[dimensions:]
         if multiples not in differences:
             sums = trajectory_features(shown, with_bandwidths(multiples), discount=discount)
-            differences[multiples] = _scaled(pair_differences(rows, sums))[0]
+            differences[multiples] = scaled_differences(pair_differences(rows, sums))[0]
         return Candidate(
             differences[multiples],
             prior_scale=prior_scale,
@@ -236,7 +240,7 @@ def choose_hyperparameters(
     )
 
 
-def _compared(
+def compared(
     trajectories: Sequence[Trajectory], pairs: Sequence[tuple[int, int]]
 ) -> tuple[list[Trajectory], list[tuple[int, int]]]:
     """The trajectories that some pair names, or one where none does, and the pairs by their numbers among these."""
@@ -245,7 +249,7 @@ def _compared(
     return [trajectories[number] for number in numbers], [(row[i], row[j]) for i, j in pairs]
 
 
-def _scaled(differences: np.ndarray) -> tuple[np.ndarray, float]:
+def scaled_differences(differences: np.ndarray) -> tuple[np.ndarray, float]:
     """Differences divided by their largest absolute entry, and that."""
     scale = float(np.max(np.abs(differences), initial=0.0)) or 1.0
     return differences / scale, scale
@@ -284,7 +288,7 @@ def estimate_utility(
         returns = np.array([trajectory.total_reward for trajectory in trajectories])
         satisfied = sum(bool(returns[i] > returns[j]) for i, j in pairs)
         return KnownReward(FitQuality(True, "known reward", len(pairs), satisfied))
-    shown, pairs = _compared(trajectories, pairs)
+    shown, pairs = compared(trajectories, pairs)
     return infer_utility(
         trajectory_features(shown, features, discount=discount),
         pairs,
@@ -332,7 +336,7 @@ def infer_utility(
         raise ValueError(f"method: expected {', '.join(METHODS)} or linear-program, got {method!r}")
     features = _as_they_are if features is None else features
     differences = pair_differences(pairs, feature_sums)
-    scaled, scale = _scaled(differences)
+    scaled, scale = scaled_differences(differences)
     if method == "linear-program":
         program = linear_program(scaled)
         satisfied = int(np.sum(differences @ program.weights > 0))

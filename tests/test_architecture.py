@@ -23,6 +23,7 @@ GROUPS = {
     "policies": ["policies"],
     "what flows round": ["trajectories", "features", "preferences", "experts"],
     "steps": ["utility", "improvement", "rollouts", "queries"],
+    "averaging": ["averaging"],
     "schedules": ["schedules"],
     "plain data": ["settings"],
     "memory": ["records"],
@@ -38,7 +39,18 @@ GROUPS = {
 }
 GROUND = ["numerics", "convergence", "environments"]
 FLOWS = [*GROUND, "models", "policies", "what flows round"]
-LEARNED = [*FLOWS, "steps", "schedules", "plain data", "memory", "events", "cycle", "run directory", "runs"]
+LEARNED = [
+    *FLOWS,
+    "steps",
+    "averaging",
+    "schedules",
+    "plain data",
+    "memory",
+    "events",
+    "cycle",
+    "run directory",
+    "runs",
+]
 ALLOWED = {
     "numerics": [],
     "convergence": [],
@@ -47,12 +59,13 @@ ALLOWED = {
     "policies": ["numerics"],
     "what flows round": ["numerics"],
     "steps": FLOWS,
+    "averaging": [*FLOWS, "steps"],
     "schedules": [*FLOWS, "steps", "diagnostics"],
     "plain data": [],
     "memory": [],
     "events": ["what flows round"],
-    "cycle": [*FLOWS, "steps", "schedules", "plain data", "events"],
-    "run directory": [*FLOWS, "steps", "plain data", "memory", "events"],
+    "cycle": [*FLOWS, "steps", "averaging", "schedules", "plain data", "events"],
+    "run directory": [*FLOWS, "steps", "averaging", "plain data", "memory", "events"],
     "runs": [*LEARNED, "report"],  # `Run.report` calls it, and imports it when called
     "diagnostics": [*LEARNED, "trials"],
     "report": [*LEARNED, "diagnostics", "trials"],

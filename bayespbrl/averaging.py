@@ -1,0 +1,159 @@
+"""The utility averaged over what the answers leave open: its length scales and the steepness of the likelihood.
+
+A few answers hardly tell "high is good" from "fast is good": the evidence of the length scales that say the one and of
+those that say the other differ by a fraction of a nat, and whichever is largest would decide what is learnt next. Here
+each setting of a grid counts with its posterior probability, p(setting | answers) ∝ p(answers | setting), and with
+expectation propagation's Gaussian for the weights (Bayesian model averaging; Hoeting, Madigan, Raftery and Volinsky
+1999).
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.special import softmax
+
+from bayespbrl.features import RadialBasis
+from bayespbrl.models.likelihoods import preference_likelihood
+from bayespbrl.models.posterior import GaussianFit, fit_gaussian
+from bayespbrl.preferences import pair_differences
+from bayespbrl.trajectories import Trajectory, trajectory_features
+from bayespbrl.utility import STEEPNESS_MULTIPLES, LinearUtility, StateFeatures, compared, scaled_differences
+
+# Of the bandwidths as given, in each state dimension; coarser than those that `utility.choose_hyperparameters` climbs
+# over, for an average has no need of a maximum.
+BANDWIDTH_MULTIPLES = (0.5, 1.4, 4.0)
+MOST_BANDWIDTHS = 27  # beyond three dimensions, so many points of the grid, drawn at random
+LEAST_PROBABILITY = 0.004  # of the bandwidths that count
+NUMBER_OF_DRAWS = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class AveragedUtility(LinearUtility):
+    """A mixture over settings, round the one that the evidence speaks for most.
+
+    What the learner acts on is the mixture's: `utilities`, `step_utilities`, `trajectory_utilities`, `state_draws` and
+    `trajectory_draws`. All else is of that one setting, whose posterior was sampled and can be diagnosed.
+
+    Attributes:
+      base: φ as given.
+      multiples: of its bandwidths, one row for each of C components, shape (C, S); S = 0 for features without any.
+      probabilities: of the components, over all steepnesses, shape (C,), summing to 1.
+      means: each component's expected weights times its probability, shape (C, D).
+      components: of which component each draw is, shape (S,).
+      weight_draws: draws of the weights in the mixture, shape (S, D).
+    """
+
+    base: StateFeatures
+    multiples: np.ndarray
+    probabilities: np.ndarray
+    means: np.ndarray
+    components: np.ndarray
+    weight_draws: np.ndarray
+
+    def utilities(self, states: np.ndarray) -> np.ndarray:
+        """Expected utility of N states, shape (N,)."""
+        return self._averaged(lambda features: features(states))
+
+    def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> np.ndarray:
+        return self._averaged(self._feature_sums(trajectories))
+
+    def state_draws(self, states: np.ndarray, *, number: int | None = None) -> np.ndarray:
+        return self._drawn(lambda features: features(states), number)
+
+    def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
+        return self._drawn(self._feature_sums(trajectories), number)
+
+    def _feature_sums(self, trajectories: Sequence[Trajectory]) -> StateFeatures:
+        return lambda features: trajectory_features(trajectories, features, discount=self.discount)
+
+    def _averaged(self, table: Callable[[StateFeatures], np.ndarray]) -> np.ndarray:
+        return np.sum([table(_rescaled(self.base, m)) @ w for m, w in zip(self.multiples, self.means, strict=True)], 0)
+
+    def _drawn(self, table: Callable[[StateFeatures], np.ndarray], number: int | None) -> np.ndarray:
+        apart = 1 if number is None else -(-len(self.components) // number)
+        components, weights = self.components[::apart], self.weight_draws[::apart]
+        order = np.argsort(components, kind="stable")
+        parts = [
+            table(_rescaled(self.base, self.multiples[c])) @ weights[components == c].T for c in np.unique(components)
+        ]
+        return np.hstack(parts).T[np.argsort(order)]
+
+
+def average_utility(
+    chosen: LinearUtility,
+    trajectories: Sequence[Trajectory],
+    pairs: Sequence[tuple[int, int]],
+    features: StateFeatures,
+    *,
+    discount: float,
+    prior_scale: float = 1.0,
+    steepness: float = 5.0,
+    lapse_rate: float = 0.0,
+    likelihood: str = "mixed",
+    seed: int = 0,
+) -> AveragedUtility:
+    """The mixture over all settings round `chosen`.
+
+    Args:
+      chosen: the estimate with the setting of highest evidence.
+      trajectories, pairs, features, …: as of `utility.choose_hyperparameters`; at least one pair.
+      seed: of the draws, and of the settings where there are too many.
+    """
+    rng = np.random.default_rng([seed, 2])
+    shown, rows = compared(trajectories, pairs)
+    multiples = _grid(len(features.bandwidths) if isinstance(features, RadialBasis) else 0, rng)
+    fits: list[list[GaussianFit]] = []
+    scales = []
+    for row in multiples:
+        sums = trajectory_features(shown, _rescaled(features, row), discount=discount)
+        differences, scale = scaled_differences(pair_differences(rows, sums))
+        scales.append(scale)
+        fits.append([])
+        for relative in STEEPNESS_MULTIPLES:
+            options = {"steepness": steepness * relative, "lapse_rate": lapse_rate}
+            density = preference_likelihood(likelihood, number_of_preferences=len(rows), **options)
+            fits[-1].append(fit_gaussian(differences, prior_scale=prior_scale, likelihood=density))
+    weights = softmax([[fit.log_evidence for fit in row] for row in fits])
+    counts = np.flatnonzero(weights.sum(axis=1) >= LEAST_PROBABILITY)
+    weights = weights[counts] / weights[counts].sum()
+    means = [
+        sum(p * (fit.factors.basis @ fit.approximation.mean) for p, fit in zip(weights[c], fits[index], strict=True))
+        / scales[index]
+        for c, index in enumerate(counts)
+    ]
+    evenly = (np.arange(NUMBER_OF_DRAWS) + rng.random()) / NUMBER_OF_DRAWS
+    settings = np.minimum(np.searchsorted(np.cumsum(weights), evenly), weights.size - 1)
+    components, steepnesses = np.divmod(settings, len(STEEPNESS_MULTIPLES))
+    draws = [_draw(fits[counts[c]][m], rng) / scales[counts[c]] for c, m in zip(components, steepnesses, strict=True)]
+    return AveragedUtility(
+        **{field.name: getattr(chosen, field.name) for field in fields(chosen)},
+        base=features,
+        multiples=multiples[counts],
+        probabilities=weights.sum(axis=1),
+        means=np.array(means),
+        components=components,
+        weight_draws=np.array(draws, dtype=np.float32),  # kept on disk; half of float64, and read back as they are
+    )
+
+
+def _grid(dimensions: int, rng: np.random.Generator) -> np.ndarray:
+    """Multiples of the bandwidths, one row a component: the grid, or some of a large one."""
+    if len(BANDWIDTH_MULTIPLES) ** dimensions <= MOST_BANDWIDTHS:
+        grid = list(itertools.product(BANDWIDTH_MULTIPLES, repeat=dimensions))
+        return np.array(grid).reshape(len(grid), dimensions)
+    return np.unique(rng.choice(BANDWIDTH_MULTIPLES, size=(MOST_BANDWIDTHS, dimensions)), axis=0)
+
+
+def _rescaled(features: StateFeatures, multiples: np.ndarray) -> StateFeatures:
+    return features.rescaled(multiples) if isinstance(features, RadialBasis) else features
+
+
+def _draw(fit: GaussianFit, rng: np.random.Generator) -> np.ndarray:
+    """One draw of the weights, shape (D,): what the answers do not touch keeps its prior."""
+    basis, approximation = fit.factors.basis, fit.approximation
+    values, directions = np.linalg.eigh(approximation.covariance)
+    z = approximation.mean + directions @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+    noise = fit.prior_scale * rng.standard_normal(len(basis))
+    return basis @ (z - basis.T @ noise) + noise
