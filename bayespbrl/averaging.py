@@ -27,6 +27,7 @@ BANDWIDTH_MULTIPLES = (0.5, 1.4, 4.0)
 MOST_BANDWIDTHS = 27  # beyond three dimensions, so many points of the grid, drawn at random
 LEAST_PROBABILITY = 0.004  # of the bandwidths that count
 NUMBER_OF_DRAWS = 200
+Table = Callable[[StateFeatures], np.ndarray]  # what one component's features are of: states, or trajectories
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +42,7 @@ class AveragedUtility(LinearUtility):
       multiples: of its bandwidths, one row for each of C components, shape (C, S); S = 0 for features without any.
       probabilities: of the components, over all steepnesses, shape (C,), summing to 1.
       means: each component's expected weights times its probability, shape (C, D).
-      components: of which component each draw is, shape (S,).
+      components: of which component each draw is, shape (S,), in increasing order.
       weight_draws: draws of the weights in the mixture, shape (S, D).
     """
 
@@ -65,20 +66,19 @@ class AveragedUtility(LinearUtility):
     def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
         return self._drawn(self._feature_sums(trajectories), number)
 
-    def _feature_sums(self, trajectories: Sequence[Trajectory]) -> StateFeatures:
+    def _feature_sums(self, trajectories: Sequence[Trajectory]) -> Table:
         return lambda features: trajectory_features(trajectories, features, discount=self.discount)
 
-    def _averaged(self, table: Callable[[StateFeatures], np.ndarray]) -> np.ndarray:
+    def _averaged(self, table: Table) -> np.ndarray:
         return np.sum([table(_rescaled(self.base, m)) @ w for m, w in zip(self.multiples, self.means, strict=True)], 0)
 
-    def _drawn(self, table: Callable[[StateFeatures], np.ndarray], number: int | None) -> np.ndarray:
+    def _drawn(self, table: Table, number: int | None) -> np.ndarray:
         apart = 1 if number is None else -(-len(self.components) // number)
         components, weights = self.components[::apart], self.weight_draws[::apart]
-        order = np.argsort(components, kind="stable")
         parts = [
             table(_rescaled(self.base, self.multiples[c])) @ weights[components == c].T for c in np.unique(components)
         ]
-        return np.hstack(parts).T[np.argsort(order)]
+        return np.hstack(parts).T
 
 
 def average_utility(

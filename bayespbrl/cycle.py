@@ -286,7 +286,7 @@ class Learner:
             choice = utility.choose_hyperparameters(state.trajectories, pairs, features, **model, **fixed)
             features = choice.features
             model = {"steepness": choice.steepness, "lapse_rate": choice.lapse_rate}
-        estimate = utility.estimate_utility(
+        estimate: Any = utility.estimate_utility(
             state.trajectories,
             pairs,
             features,

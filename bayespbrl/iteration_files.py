@@ -154,5 +154,5 @@ def _read_estimate(tree: xr.DataTree, features: Any, known: Sequence[type]) -> A
         return estimate
     average = tree.children["average"]
     base = records.from_tree(average.children["base"], known=known) if "base" in average.children else features
-    arrays = {name: average.dataset[name].values for name in AVERAGE}
+    arrays: dict[str, Any] = {name: average.dataset[name].values for name in AVERAGE}
     return AveragedUtility(**vars(estimate), base=base, **arrays)

@@ -102,7 +102,8 @@ def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
     """The utility over the state space.
 
     Returns:
-      along `state`: `used`, what the learner took for the utility; where there is a posterior, its `mean` and `sd`,
+      along `state`: `used`, what the learner took for the utility (of an `AveragedUtility` the average, and all else
+      of its likeliest setting); where there is a posterior, its `mean` and `sd`,
       `prior_sd`, and `draws` (draw, state), three of them; all in the units of the weights; `states`, the observations;
       `visits`, how often each was seen (discrete states); `reached`, whether φ is more than next to nothing there, as
       it is not far from every centre.
@@ -121,7 +122,7 @@ def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
     shown, attrs = _states_to_show(evidence, states, np.random.default_rng(seed))
     features = estimate.features(shown)
     lengths = np.linalg.norm(features, axis=1)
-    data: dict[str, Any] = {"used": ("state", features @ estimate.weights)}
+    data: dict[str, Any] = {"used": ("state", estimate.utilities(shown))}
     data["reached"] = ("state", lengths > 0.01 * np.max(lengths, initial=0.0))
     data["states"] = (("state",) if shown.ndim == 1 else ("state", "observation"), shown)
     if states.ndim == 1:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from bayespbrl.averaging import AveragedUtility
 from bayespbrl.diagnostics import report_figures as figures
 from bayespbrl.diagnostics.report_document import Picture, Section, drawn
 from bayespbrl.diagnostics.report_evidence import Evidence
@@ -23,6 +24,14 @@ def utility(evidence: Evidence, ranking: xr.Dataset) -> Section:
         return Section("utility", title, [f"The features φ are a function of your own: {evidence.features_missing}."])
     blocks: list[Any] = []
     text = [] if evidence.posterior is not None else [no_posterior(evidence)]
+    if isinstance(evidence.estimate, AveragedUtility):
+        likeliest = percent(evidence.estimate.probabilities.max())
+        text.append(
+            f"The learner acted on an average over {len(evidence.estimate.probabilities)} choices of length scales, "
+            f"the likeliest of probability {likeliest}. The trajectories below are ordered by that average; mean, "
+            "deviation and draws over the states, and all that is said of convergence, are of the one setting whose "
+            "posterior was sampled."
+        )
     if hasattr(evidence.estimate, "utilities"):
         table = utility_table(evidence)
         blocks += _maps(table)

@@ -17,16 +17,17 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import rankdata
 
+from bayespbrl.averaging import AveragedUtility
 from bayespbrl.cycle import Learner
 from bayespbrl.improvement import QFunction, estimate_q
-from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
+from bayespbrl.trajectories import Trajectory, transitions
 
 # Quantiles of the intervals in the figures: half and nine tenths of the draws.
 INTERVALS = ((0.25, 0.75, 4.0), (0.05, 0.95, 1.2))
 
 
 def return_draws(estimate: Any, trajectories: Sequence[Trajectory], *, number: int = 1000) -> xr.Dataset:
-    """Posterior draws of the discounted return wᵀψ(τ) of each trajectory.
+    """Posterior draws of the utility wᵀψ(τ) of each trajectory; an average's as one chain.
 
     Args:
       estimate: a `LinearUtility` with a posterior.
@@ -39,10 +40,10 @@ def return_draws(estimate: Any, trajectories: Sequence[Trajectory], *, number: i
     Raises:
       ValueError: an estimate without a posterior; no trajectories; a number < 1.
     """
-    features = _with_posterior(estimate).features
-    draws = estimate.draws(trajectory_features(trajectories, features, discount=estimate.discount), number=number)
+    draws = _with_posterior(estimate).trajectory_draws(trajectories, number=number)
+    chains = 1 if isinstance(estimate, AveragedUtility) else estimate.posterior["posterior"].sizes["chain"]
     return xr.Dataset(
-        {"returns": (("chain", "draw", "trajectory"), draws)},
+        {"returns": (("chain", "draw", "trajectory"), draws.reshape(chains, -1, len(trajectories)))},
         {"trajectory": np.arange(len(trajectories))},
         _honesty(estimate),
     )

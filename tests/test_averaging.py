@@ -1,0 +1,186 @@
+"""The utility averaged over length scales and steepness, against importance sampling from the prior."""
+
+import numpy as np
+import pytest
+
+from bayespbrl import Learner, ReturnExpert, cycle, queries
+from bayespbrl.averaging import BANDWIDTH_MULTIPLES, MOST_BANDWIDTHS, average_utility
+from bayespbrl.features import OneHot, RadialBasis
+from bayespbrl.iteration_files import read_iteration
+from bayespbrl.runs import start
+from bayespbrl.trajectories import Trajectory, trajectory_features
+from bayespbrl.utility import STEEPNESS_MULTIPLES, choose_hyperparameters, estimate_utility
+
+LINE = RadialBasis(np.linspace(-1, 1, 5)[:, None], np.array([0.4]), np.array([np.inf]), normalised=True)
+PAIRS = [(0, 1), (0, 2), (3, 2)]
+STATES = np.linspace(-1.2, 1.2, 7)[:, None]
+ALL = {"utility": "posterior-mean", "schedule": "confidence", "query": "information-when-unsure"}
+QUICK = {"max_steps": 20, "evaluation_episodes": 3, "seed": 7, "hyperparameters": "averaged"}
+
+
+def walks(number=4):
+    rng = np.random.default_rng(3)
+    made = []
+    for start_at in (0.7, -0.2, -0.9, 0.1, 0.4, -0.5, 0.9)[:number]:
+        states = np.clip(start_at + np.cumsum(rng.normal(scale=0.15, size=(7, 1)), axis=0), -1, 1)
+        made.append(Trajectory(states, np.zeros((6, 1)), np.zeros(6)))
+    return made
+
+
+def averaged(features, trajectories, pairs, *, likelihood="logistic", seed=0):
+    options = {"discount": 1.0, "likelihood": likelihood}
+    choice = choose_hyperparameters(trajectories, pairs, features, **options)
+    chosen = estimate_utility(
+        trajectories, pairs, choice.features, method="posterior-mean", steepness=choice.steepness, **options
+    )
+    return average_utility(chosen, trajectories, pairs, features, seed=seed, **options)
+
+
+def test_mean_and_spread_are_those_of_the_mixture_by_importance_sampling():
+    # The posterior over (setting, weights) by weighing draws of the prior by the likelihood: no Gaussian, no evidence.
+    trajectories, rng = walks(5), np.random.default_rng(0)
+    worth = [np.sin(4 * trajectory.states[1:]).sum() for trajectory in trajectories]
+    pairs = [(i, j) for i in range(5) for j in range(5) if worth[i] > worth[j]]
+    weights, utilities = [], []
+    for multiple in BANDWIDTH_MULTIPLES:
+        features = LINE.rescaled([multiple])
+        sums = trajectory_features(trajectories, features, discount=1.0)
+        differences = np.array([sums[i] - sums[j] for i, j in pairs])
+        scale = np.abs(differences).max()
+        for relative in STEEPNESS_MULTIPLES:
+            w = rng.normal(size=(300_000, 5))
+            margins = w @ differences.T / scale
+            weights.append(np.prod(1 / (1 + np.exp(-5.0 * relative * margins)), axis=1))
+            utilities.append(w @ features(STATES).T / scale)
+    p, u = np.concatenate(weights), np.concatenate(utilities)
+    p /= p.sum()
+    mean = p @ u
+    spread = np.sqrt(p @ (u - mean) ** 2)
+
+    estimate = averaged(LINE, trajectories, pairs)
+    np.testing.assert_allclose(estimate.utilities(STATES), mean, atol=0.05 * spread.max())
+    of_each = np.array([part.sum() for part in np.split(p, 9)]).reshape(3, 3).sum(axis=1)
+    np.testing.assert_allclose(estimate.probabilities, of_each, atol=0.03)
+    assert of_each.max() > 2 * of_each.min()  # the answers speak for some more than for others
+    draws = np.concatenate([averaged(LINE, trajectories, pairs, seed=s).state_draws(STATES) for s in range(10)])
+    assert draws.shape == (2000, 7)
+    np.testing.assert_allclose(draws.mean(axis=0), mean, atol=4 * spread.max() / np.sqrt(2000) + 0.03 * spread.max())
+    np.testing.assert_allclose(draws.std(axis=0), spread, rtol=0.1)
+    assert estimate.probabilities.sum() == pytest.approx(1)
+
+
+def test_a_trajectory_is_worth_the_sum_of_its_states_in_the_mean_and_in_every_draw():
+    trajectories = walks()
+    estimate = averaged(LINE, trajectories, PAIRS)
+    states = np.concatenate([trajectory.states[1:] for trajectory in trajectories])
+    np.testing.assert_allclose(
+        estimate.trajectory_utilities(trajectories), estimate.utilities(states).reshape(4, 6).sum(axis=1), rtol=1e-10
+    )
+    for number in (None, 50, 1):
+        drawn = estimate.trajectory_draws(trajectories, number=number)
+        of_states = estimate.state_draws(states, number=number)
+        np.testing.assert_allclose(drawn, of_states.reshape(len(drawn), 4, 6).sum(axis=2), atol=1e-10)
+    assert len(drawn) == 1
+
+
+def test_each_draw_is_of_its_own_component():
+    estimate = averaged(LINE, walks(), PAIRS)
+    assert len(set(estimate.components)) == len(BANDWIDTH_MULTIPLES)  # three answers leave all open
+    drawn = estimate.state_draws(STATES)
+    for draw in (0, 77, 199):
+        features = LINE.rescaled(estimate.multiples[estimate.components[draw]])
+        np.testing.assert_allclose(drawn[draw], features(STATES) @ estimate.weight_draws[draw], atol=1e-12)
+    shares = np.bincount(estimate.components) / len(estimate.components)
+    np.testing.assert_allclose(shares, estimate.probabilities, atol=1.01 / 200)  # drawn evenly
+
+
+def test_features_without_bandwidths_are_averaged_over_the_steepness_alone():
+    stays = [Trajectory(np.full(5, s), np.zeros(4, dtype=int), np.zeros(4)) for s in range(3)]
+    estimate = averaged(OneHot(3), stays, [(1, 0), (2, 1)], likelihood="mixed")
+    assert estimate.multiples.shape == (1, 0)
+    assert estimate.utilities(np.arange(3))[2] > estimate.utilities(np.arange(3))[0]
+
+
+def test_of_many_dimensions_some_length_scales_are_taken():
+    centres = np.random.default_rng(1).uniform(-1, 1, size=(6, 4))
+    features = RadialBasis(centres, np.full(4, 0.5), np.full(4, np.inf), normalised=True)
+    walk = [Trajectory(centres[[i, i + 1, i]], np.zeros((2, 1)), np.zeros(2)) for i in range(3)]
+    estimate = averaged(features, walk, [(0, 1), (1, 2)], likelihood="mixed")
+    assert 1 < len(estimate.multiples) <= MOST_BANDWIDTHS
+    assert len(np.unique(estimate.multiples, axis=0)) == len(estimate.multiples)
+    assert set(estimate.multiples.flat) <= set(BANDWIDTH_MULTIPLES)
+
+
+def test_a_run_keeps_the_average(tmp_path):
+    learner = start("swing-up", tmp_path / "run", iterations=2, centres=20, **ALL, **QUICK)
+    learner.run(ReturnExpert())
+    estimate = read_iteration(tmp_path / "run" / "iterations" / "0002.nc", "improved")["estimate"]
+    states = learner.trajectories[0].states
+    assert len(estimate.multiples) > 1
+    np.testing.assert_array_equal(estimate.utilities(states), learner.estimate.utilities(states))
+    np.testing.assert_array_equal(estimate.state_draws(states), learner.estimate.state_draws(states))
+    report = learner_report(tmp_path / "run")
+    assert f"an average over {len(estimate.multiples)} choices of length scales" in report
+
+
+def learner_report(directory):
+    from bayespbrl.diagnostics.report import write_report
+
+    return write_report(directory).read_text()
+
+
+@pytest.mark.parametrize("sure", [0.0, 1.1])
+def test_an_unsure_learner_asks_for_information_about_all_that_was_never_shown(sure, monkeypatch):
+    monkeypatch.setattr(cycle, "SURE_SIGNAL", sure)
+    run = Learner("swing-up", iterations=4, centres=20, **ALL, **QUICK)
+    newcomers, old = [], 0
+    while questions := run.ask():
+        (question,) = questions
+        if run.state.iteration:
+            shown = {number for query in newcomers for number in query}
+            numbers = [i for i in range(len(run.trajectories)) if i not in shown]
+            assert question.newcomer in numbers
+            if sure == 0.0:  # never unsure: the paper's rule
+                numbers = list(range(len(run.trajectories) - 10, len(run.trajectories)))
+                scores = run.estimate.trajectory_utilities([run.trajectories[i] for i in numbers])
+            else:
+                asked = [run.trajectories[i] for i in [*numbers, question.incumbent]]
+                draws = run.estimate.trajectory_draws(asked)
+                likelihood = run.estimate.likelihood
+                scores = queries.expected_information(draws[:, :-1], draws[:, -1], likelihood=likelihood)
+            assert scores[numbers.index(question.newcomer)] == scores.max()
+            assert len(run.state.candidates) == 10
+            old += question.newcomer < len(run.trajectories) - 10
+        newcomers.append((question.first, question.second))
+        run.tell([ReturnExpert()(*question.trajectories)])
+    assert (old > 0) == (sure > 1)
+
+
+def test_what_cannot_be_tells_nothing_and_is_not_asked_again():
+    run = Learner("gridworld", iterations=3, **ALL, **(QUICK | {"hyperparameters": "given"}))
+    skipped = []
+    while questions := run.ask():
+        (question,) = questions
+        assert question.newcomer not in skipped
+        if run.state.iteration and len(skipped) < 3:
+            skipped.append(question.newcomer)
+            run.tell(["skip"])
+        else:
+            run.tell([ReturnExpert()(*question.trajectories)])
+    assert len(skipped) == 3
+    assert run.preferences.answers == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"query": "information-when-unsure"}, "schedule: expected confidence with the query information-when-unsure"),
+        (
+            {"hyperparameters": "averaged", "utility": "linear-program"},
+            "utility: expected posterior-mean with averaged",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_refused(options, message):
+    with pytest.raises(ValueError, match=f"^{message}.*, got "):
+        Learner("gridworld", **options)
