@@ -14,12 +14,19 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.special import softmax
 
-from bayespbrl.features import RadialBasis
-from bayespbrl.models.likelihoods import preference_likelihood
-from bayespbrl.models.posterior import GaussianFit, fit_gaussian
+from bayespbrl.models.hyperparameters import Candidate, fit_candidate
+from bayespbrl.models.posterior import GaussianFit
 from bayespbrl.preferences import pair_differences
 from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility import STEEPNESS_MULTIPLES, LinearUtility, StateFeatures, compared, scaled_differences
+from bayespbrl.utility import (
+    STEEPNESS_MULTIPLES,
+    LinearUtility,
+    StateFeatures,
+    compared,
+    number_of_bandwidths,
+    rescaled,
+    scaled_differences,
+)
 
 # Of the bandwidths as given, in each state dimension; coarser than those that `utility.choose_hyperparameters` climbs
 # over, for an average has no need of a maximum.
@@ -70,13 +77,13 @@ class AveragedUtility(LinearUtility):
         return lambda features: trajectory_features(trajectories, features, discount=self.discount)
 
     def _averaged(self, table: Table) -> np.ndarray:
-        return np.sum([table(_rescaled(self.base, m)) @ w for m, w in zip(self.multiples, self.means, strict=True)], 0)
+        return np.sum([table(rescaled(self.base, m)) @ w for m, w in zip(self.multiples, self.means, strict=True)], 0)
 
     def _drawn(self, table: Table, number: int | None) -> np.ndarray:
         apart = 1 if number is None else -(-len(self.components) // number)
         components, weights = self.components[::apart], self.weight_draws[::apart]
         parts = [
-            table(_rescaled(self.base, self.multiples[c])) @ weights[components == c].T for c in np.unique(components)
+            table(rescaled(self.base, self.multiples[c])) @ weights[components == c].T for c in np.unique(components)
         ]
         return np.hstack(parts).T
 
@@ -103,18 +110,23 @@ def average_utility(
     """
     rng = np.random.default_rng([seed, 2])
     shown, rows = compared(trajectories, pairs)
-    multiples = _grid(len(features.bandwidths) if isinstance(features, RadialBasis) else 0, rng)
+    multiples = _grid(number_of_bandwidths(features), rng)
     fits: list[list[GaussianFit]] = []
     scales = []
     for row in multiples:
-        sums = trajectory_features(shown, _rescaled(features, row), discount=discount)
+        sums = trajectory_features(shown, rescaled(features, row), discount=discount)
         differences, scale = scaled_differences(pair_differences(rows, sums))
         scales.append(scale)
         fits.append([])
         for relative in STEEPNESS_MULTIPLES:
-            options = {"steepness": steepness * relative, "lapse_rate": lapse_rate}
-            density = preference_likelihood(likelihood, number_of_preferences=len(rows), **options)
-            fits[-1].append(fit_gaussian(differences, prior_scale=prior_scale, likelihood=density))
+            candidate = Candidate(
+                differences,
+                prior_scale=prior_scale,
+                steepness=steepness * relative,
+                lapse_rate=lapse_rate,
+                likelihood=likelihood,
+            )
+            fits[-1].append(fit_candidate(candidate))
     weights = softmax([[fit.log_evidence for fit in row] for row in fits])
     counts = np.flatnonzero(weights.sum(axis=1) >= LEAST_PROBABILITY)
     weights = weights[counts] / weights[counts].sum()
@@ -144,10 +156,6 @@ def _grid(dimensions: int, rng: np.random.Generator) -> np.ndarray:
         grid = list(itertools.product(BANDWIDTH_MULTIPLES, repeat=dimensions))
         return np.array(grid).reshape(len(grid), dimensions)
     return np.unique(rng.choice(BANDWIDTH_MULTIPLES, size=(MOST_BANDWIDTHS, dimensions)), axis=0)
-
-
-def _rescaled(features: StateFeatures, multiples: np.ndarray) -> StateFeatures:
-    return features.rescaled(multiples) if isinstance(features, RadialBasis) else features
 
 
 def _draw(fit: GaussianFit, rng: np.random.Generator) -> np.ndarray:

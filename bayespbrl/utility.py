@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 from xarray import DataTree
 
 from bayespbrl.features import RadialBasis
@@ -203,16 +204,13 @@ def choose_hyperparameters(
     Source: specification, section 8: the utility's length scale is chosen by evidence.
     """
     shown, rows = compared(trajectories, pairs)
-    dimensions = len(features.bandwidths) if isinstance(features, RadialBasis) else 0
+    dimensions = number_of_bandwidths(features)
     differences: dict[tuple[float, ...], np.ndarray] = {}
-
-    def with_bandwidths(multiples: tuple[float, ...]) -> StateFeatures:
-        return features.rescaled(multiples) if isinstance(features, RadialBasis) else features
 
     def candidate(point: tuple[float, ...]) -> Candidate:
         multiples, (relative_steepness, lapses) = point[:dimensions], point[dimensions:]
         if multiples not in differences:
-            sums = trajectory_features(shown, with_bandwidths(multiples), discount=discount)
+            sums = trajectory_features(shown, rescaled(features, multiples), discount=discount)
             differences[multiples] = scaled_differences(pair_differences(rows, sums))[0]
         return Candidate(
             differences[multiples],
@@ -229,7 +227,7 @@ def choose_hyperparameters(
     search = search_hyperparameters(candidate, axes, start=start, together=dimensions)
     log_evidence = search.weighed.log_evidence
     return HyperparameterChoice(
-        with_bandwidths(search.best[:dimensions]),
+        rescaled(features, search.best[:dimensions]),
         steepness * search.best[dimensions],
         search.best[dimensions + 1],
         search.best[:dimensions],
@@ -238,6 +236,16 @@ def choose_hyperparameters(
         float(search.weighed.weights[search.reached]),
         len(search.points),
     )
+
+
+def number_of_bandwidths(features: StateFeatures) -> int:
+    """S where φ has a bandwidth in each state dimension, 0 where it has none."""
+    return len(features.bandwidths) if isinstance(features, RadialBasis) else 0
+
+
+def rescaled(features: StateFeatures, multiples: ArrayLike) -> StateFeatures:
+    """φ with `multiples` of its bandwidths, where it has any."""
+    return features.rescaled(multiples) if isinstance(features, RadialBasis) else features
 
 
 def compared(

@@ -450,15 +450,20 @@ def compilations_after(run, iteration):
     return len(count)
 
 
-def test_answers_have_a_discount_of_their_own(monkeypatch):
-    seen = []
-    real = improvement.improve
+def seen_by_improve(monkeypatch, name):
+    """What step 2 is given as `name`, a value for each call from now on."""
+    seen, real = [], improvement.improve
 
-    def improve(*args, discount, **options):
-        seen.append(discount)
-        return real(*args, discount=discount, **options)
+    def improve(*args, **options):
+        seen.append(options[name])
+        return real(*args, **options)
 
     monkeypatch.setattr(improvement, "improve", improve)
+    return seen
+
+
+def test_answers_have_a_discount_of_their_own(monkeypatch):
+    seen = seen_by_improve(monkeypatch, "discount")
     run = learner(iterations=1, discount=0.9, trajectory_discount=1.0).run(ReturnExpert())
     assert seen == [0.9]
     trajectory = run.trajectories[3]
@@ -468,14 +473,7 @@ def test_answers_have_a_discount_of_their_own(monkeypatch):
 
 
 def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch):
-    seen = []
-    real = improvement.improve
-
-    def improve(*args, visited, **options):
-        seen.append(visited)
-        return real(*args, visited=visited, **options)
-
-    monkeypatch.setattr(improvement, "improve", improve)
+    seen = seen_by_improve(monkeypatch, "visited")
     options = {"iterations": 3, "max_steps": 12, "centres": 20, "evaluation_episodes": 2, "utility": "linear-program"}
     run = Learner("swing-up", seed=3, update_states=150, recent_iterations=2, **options).run(ReturnExpert())
     acted = [{tuple(state) for state in trajectory.states[:-1]} for trajectory in run.trajectories]

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from bayespbrl.models.likelihoods import preference_likelihood
-from bayespbrl.models.posterior import fit_gaussian
+from bayespbrl.models.posterior import GaussianFit, fit_gaussian
 
 LEAST_GAIN = 1e-6  # nats; evidence that differs by rounding only says nothing
 
@@ -53,6 +53,15 @@ class HyperparameterWeights:
         return int(np.argmax(self.weights))
 
 
+def fit_candidate(candidate: Candidate) -> GaussianFit:
+    """Expectation propagation's Gaussian under this setting, with its log evidence; errors as of `fit_gaussian`."""
+    c = candidate
+    likelihood = preference_likelihood(
+        c.likelihood, steepness=c.steepness, number_of_preferences=len(c.differences), lapse_rate=c.lapse_rate
+    )
+    return fit_gaussian(c.differences, prior_scale=c.prior_scale, likelihood=likelihood)
+
+
 def select_hyperparameters(candidates: Sequence[Candidate]) -> HyperparameterWeights:
     """Weigh candidates by p(candidate | answers) ∝ p(answers | candidate) p(candidate).
 
@@ -66,12 +75,7 @@ def select_hyperparameters(candidates: Sequence[Candidate]) -> HyperparameterWei
     numbers = sorted({len(candidate.differences) for candidate in candidates})
     if len(numbers) > 1:
         raise ValueError(f"candidates: expected the same number of answers K in each, got {numbers}")
-    fits = []
-    for c in candidates:
-        likelihood = preference_likelihood(
-            c.likelihood, steepness=c.steepness, number_of_preferences=numbers[0], lapse_rate=c.lapse_rate
-        )
-        fits.append(fit_gaussian(c.differences, prior_scale=c.prior_scale, likelihood=likelihood))
+    fits = [fit_candidate(candidate) for candidate in candidates]
     log_evidence = np.array([fit.log_evidence for fit in fits])
     log_weights = log_evidence + np.array([candidate.log_prior for candidate in candidates])
     return HyperparameterWeights(
