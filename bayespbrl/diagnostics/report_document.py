@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
 
@@ -80,7 +81,8 @@ def drawn(
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(columns * size[0], rows * size[1]), layout="constrained")
+    room = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08, wspace=0.05, hspace=0.05)
+    figure = Figure(figsize=(columns * size[0], rows * size[1]), layout=room)
     FigureCanvasAgg(figure)
     grid = np.ravel(figure.subplots(rows, columns, squeeze=False))
     for axes, (title, draw) in zip(grid, panels, strict=False):

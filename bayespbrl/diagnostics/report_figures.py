@@ -176,8 +176,10 @@ def plot_answers(table: xr.Dataset, axes: Axes) -> Axes:
 def _series(table: xr.Dataset, axes: Axes, names: dict[str, str], *, converged: str | None = None) -> None:
     iterations = table["iteration"].values
     for number, (name, label) in enumerate(names.items()):
-        style = "--" if number == 0 and len(names) > 1 else "-"
-        axes.plot(iterations, table[name], style, marker="o", markersize=3.5, color=f"C{number}", label=label)
+        look: dict[str, Any] = {"marker": "o", "markersize": 3.5, "color": f"C{number}"}
+        if number == 0 and len(names) > 1:  # what the others are held against: on top, and they show through
+            look = {"linestyle": "--", "color": "0.2", "linewidth": 1.2, "zorder": 3}
+        axes.plot(iterations, table[name], label=label, **look)
         if converged is not None and (failed := table[converged].values == 0).any():
             at = table[name].values[failed]
             axes.plot(iterations[failed], at, "x", markersize=9, color=OPEN, label="not converged")

@@ -89,13 +89,15 @@ def _maps(table: xr.Dataset) -> list[Picture]:
         )
         if not np.array_equal(table["used"], table["mean"]):
             shown.append(("used", "As the learner used it", "utility", "viridis"))
+            caption += " The learner acted on the fourth."
     if np.isnan(blank).any():
         caption += " Grey: too far from every centre of the features for the utility to be anything but zero."
     panels = [
         (title, partial(figures.plot_states, table, table[name].values + blank, label=label, cmap=colours))
         for name, title, label, colours in shown
     ]
-    blocks = [drawn("utility", panels, caption, f"Map of the utility {where}.", columns=3, size=(3.5, 2.9))]
+    columns = 2 if len(panels) == 4 else 3
+    blocks = [drawn("utility", panels, caption, f"Map of the utility {where}.", columns=columns, size=(3.5, 2.9))]
     if "draws" in table:
         draws = table["draws"].values
         limits: dict[str, Any] = {"vmin": float(draws.min()), "vmax": float(draws.max()), "cmap": "viridis"}
