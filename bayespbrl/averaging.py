@@ -62,30 +62,42 @@ class AveragedUtility(LinearUtility):
 
     def utilities(self, states: np.ndarray) -> np.ndarray:
         """Expected utility of N states, shape (N,)."""
-        return self._averaged(lambda features: features(states))
+        return self._mixed(_of_states(states), slice(0))[0]
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> np.ndarray:
-        return self._averaged(self._feature_sums(trajectories))
+        return self._mixed(self._of_trajectories(trajectories), slice(0))[0]
 
     def state_draws(self, states: np.ndarray, *, number: int | None = None) -> np.ndarray:
-        return self._drawn(lambda features: features(states), number)
+        return self._mixed(_of_states(states), self._spaced(number))[1]
 
     def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
-        return self._drawn(self._feature_sums(trajectories), number)
+        return self._mixed(self._of_trajectories(trajectories), self._spaced(number))[1]
 
-    def _feature_sums(self, trajectories: Sequence[Trajectory]) -> Table:
+    def utilities_and_draws(self, states: np.ndarray, *, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        return self._mixed(_of_states(states), self._spaced(number))
+
+    def _of_trajectories(self, trajectories: Sequence[Trajectory]) -> Table:
         return lambda features: trajectory_features(trajectories, features, discount=self.discount)
 
-    def _averaged(self, table: Table) -> np.ndarray:
-        return np.sum([table(rescaled(self.base, m)) @ w for m, w in zip(self.multiples, self.means, strict=True)], 0)
+    def _spaced(self, number: int | None) -> slice:
+        """At most `number` of the draws, evenly spaced."""
+        if number is not None and number < 1:
+            raise ValueError(f"number: expected at least 1 draw, got {number}")
+        return slice(None, None, None if number is None else -(-len(self.components) // number))
 
-    def _drawn(self, table: Table, number: int | None) -> np.ndarray:
-        apart = 1 if number is None else -(-len(self.components) // number)
-        components, weights = self.components[::apart], self.weight_draws[::apart]
-        parts = [
-            table(rescaled(self.base, self.multiples[c])) @ weights[components == c].T for c in np.unique(components)
-        ]
-        return np.hstack(parts).T
+    def _mixed(self, table: Table, draws: slice) -> tuple[np.ndarray, np.ndarray]:
+        """The mean for each of n rows of `table`, (n,), and some draws, (S, n): one pass over the components."""
+        components, weights = self.components[draws], self.weight_draws[draws]
+        means, drawn = [], []
+        for component, multiples in enumerate(self.multiples):
+            features = table(rescaled(self.base, multiples))
+            means.append(features @ self.means[component])
+            drawn.append(features @ weights[components == component].T)
+        return np.sum(means, axis=0), np.hstack(drawn).T
+
+
+def _of_states(states: np.ndarray) -> Table:
+    return lambda features: features(states)
 
 
 def average_utility(

@@ -349,7 +349,8 @@ class Learner:
         """uᵢ of each step, (N,), and under posterior draws, (N, S); None where no schedule asks or there are none."""
         if isinstance(self.schedule, schedules.ConstantBound) or getattr(estimate, "posterior", None) is None:
             return estimate.step_utilities(steps), None
-        return estimate.step_utilities(steps), estimate.state_draws(steps.next_states, number=SCHEDULE_DRAWS).T
+        utilities, draws = estimate.utilities_and_draws(steps.next_states, number=SCHEDULE_DRAWS)
+        return utilities, draws.T
 
     def _visited_states(self) -> np.ndarray:
         """States in which the last iterations acted: those of the policy update, and no more than the settings say."""

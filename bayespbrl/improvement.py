@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import cached_property, partial, reduce
 from operator import add
 from typing import Any
 
@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 
 from bayespbrl.lstd import TransitionSums, solve_lstd, transition_sums
 from bayespbrl.policies import entropies, sample_actions
-from bayespbrl.reps import RepsSolution, reps_weights, reps_weights_by_state
+from bayespbrl.reps import RepsSolution, WhitenedFeatures, advantages, reps_weights, reps_weights_by_state, whitened
 from bayespbrl.trajectories import Transitions
 
 ROWS_AT_A_TIME = 16_384
@@ -76,20 +76,36 @@ class ProposedUpdate:
     q_draws: np.ndarray | None = None
     solved: dict[float, RepsSolution] = field(default_factory=dict, repr=False)
 
+    @cached_property
+    def constraint(self) -> WhitenedFeatures | np.ndarray:
+        """The features whitened, which every bound shares; or the states' numbers."""
+        if self.state_features.ndim == 1:
+            return self.state_features
+        return whitened(self.state_features, self.base_weights)
+
     def solve(self, kl_bound: float) -> RepsSolution:
         """REPS for the mean Q at this bound (eqs. 11-13); each bound is solved once."""
         if kl_bound not in self.solved:
-            solve = reps_weights_by_state if self.state_features.ndim == 1 else reps_weights
+            if isinstance(self.constraint, WhitenedFeatures):
+                solve = partial(reps_weights, constraint=self.constraint)
+            else:
+                solve = reps_weights_by_state
             self.solved[kl_bound] = solve(self.q_values, self.state_features, self.base_weights, kl_bound=kl_bound)
         return self.solved[kl_bound]
 
-    def gains(self, kl_bound: float) -> np.ndarray:
-        """Σ (pᵢ − Wᵢ)Qᵢ under each draw: what it expects of the update at this bound, in its utility's units; (S,)."""
+    def gains(self, kl_bound: float | None = None) -> np.ndarray:
+        """Σ (pᵢ − Wᵢ)Qᵢ under each draw: what it expects of the update at this bound, in its utility's units; (S,).
+
+        Without a bound, of the smallest updates, up to a factor that all draws share: Σ WᵢAᵢQᵢ with the `advantages` A
+        of the mean Q. That takes no solution of REPS.
+        """
         if self.q_draws is None:
             raise ValueError("gains: expected a utility estimate with a posterior, got one without")
+        if kl_bound is None:
+            return (self.base_weights * advantages(self.q_values, self.constraint, self.base_weights)) @ self.q_draws
         return (self.solve(kl_bound).probabilities - self.base_weights) @ self.q_draws
 
-    def agreement(self, kl_bound: float) -> float:
+    def agreement(self, kl_bound: float | None = None) -> float:
         """Share of the draws that expect a gain."""
         return float(np.mean(self.gains(kl_bound) > 0))
 

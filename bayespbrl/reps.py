@@ -46,19 +46,43 @@ class RepsSolution:
     status: str
 
 
+@dataclass(frozen=True)
+class WhitenedFeatures:
+    """Features of the constraint, centred and of unit variance under W, which no bound changes.
+
+    Attributes:
+      features: shape (N, r).
+      mapping: from the centred features as given to these, shape (D, r).
+    """
+
+    features: np.ndarray
+    mapping: np.ndarray
+
+
+def whitened(state_features: np.ndarray, base_weights: np.ndarray, *, rank_tolerance: float = 1e-3) -> WhitenedFeatures:
+    """Features (N, D) whitened under W, (N,); directions below `rank_tolerance` of the largest singular value go."""
+    centred = state_features - base_weights @ state_features
+    covariance = centred.T @ (centred * base_weights[:, None])
+    values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
+    keep = values > max(values[-1], 0.0) * rank_tolerance**2
+    if not np.any(keep) or values[-1] <= 1e-24:
+        return WhitenedFeatures(np.zeros((len(centred), 0)), np.zeros((centred.shape[1], 0)))
+    mapping = vectors[:, keep] / np.sqrt(values[keep])
+    return WhitenedFeatures(centred @ mapping, mapping)
+
+
 def reps_weights(
     q_values: np.ndarray,
     state_features: np.ndarray,
     base_weights: np.ndarray,
     *,
     kl_bound: float,
-    rank_tolerance: float = 1e-3,
+    constraint: WhitenedFeatures | None = None,
 ) -> RepsSolution:
     """Maximise Σ pᵢQᵢ subject to KL(p‖W) ≤ ε and Σ pᵢφᵢ = φ̂ by the dual of eq. 13.
 
-    The dual in raw radial basis features is hopelessly ill-conditioned, so the features are centred and whitened,
-    directions below `rank_tolerance` of the largest singular value dropped, and Q standardised; then CasADi's IPOPT
-    with limited-memory Hessian needs some twenty iterations.
+    The dual in raw radial basis features is hopelessly ill-conditioned, so the features are whitened and Q is
+    standardised; then CasADi's IPOPT with limited-memory Hessian needs some twenty iterations.
 
     Args:
       q_values: Qᵢ, shape (N,).
@@ -66,7 +90,7 @@ def reps_weights(
       base_weights: Wᵢ > 0 with sum 1, shape (N,): 1/N for fresh samples of the policy, q(a|s) × visits for all actions
         of each visited state.
       kl_bound: ε > 0, nats.
-      rank_tolerance: relative singular value below which a direction of the features is left unconstrained.
+      constraint: φ `whitened` under W, where it is at hand.
 
     Raises:
       ValueError: shapes that do not fit, a bound that is not positive and finite, entries that are not finite.
@@ -74,19 +98,20 @@ def reps_weights(
     Source: paper, eqs. 11-13; Daniel, Neumann and Peters (2012) for the feature constraint.
     """
     _check(q_values, state_features, base_weights, kl_bound)
-    whitened, unwhiten = _whiten(state_features, base_weights, rank_tolerance)
+    constraint = whitened(state_features, base_weights) if constraint is None else constraint
+    features = constraint.features
     mean = base_weights @ q_values
     spread = np.sqrt(base_weights @ (q_values - mean) ** 2)
     # what LSTD's penalties leave of a constant Q is noise, and must not be blown up to the size of the bound
     scale, temperature, converged, status = 1.0, 1.0, True, "constant Q: nothing to gain"
-    standardised, dual = np.zeros_like(q_values), np.zeros(whitened.shape[1])  # the weights that change nothing
+    standardised, dual = np.zeros_like(q_values), np.zeros(features.shape[1])  # the weights that change nothing
     if spread > 1e-8 * np.abs(mean):
         scale = spread
         scaled = (q_values - mean) / scale
-        reached, multipliers, converged, status = _solve_dual(scaled, whitened, base_weights, kl_bound)
+        reached, multipliers, converged, status = _solve_dual(scaled, features, base_weights, kl_bound)
         if converged:  # what an unfinished solver leaves is no update: stay where we are, and say so
             temperature, dual, standardised = reached, multipliers, scaled
-    logits = np.log(base_weights) + (standardised - whitened @ dual) / temperature  # (eq. 12)
+    logits = np.log(base_weights) + (standardised - features @ dual) / temperature  # (eq. 12)
     probabilities = np.exp(logits - np.max(logits))
     probabilities /= np.sum(probabilities)
     ratio = probabilities / base_weights
@@ -95,14 +120,14 @@ def reps_weights(
     return RepsSolution(
         sample_weights=ratio,  # mean Σ W·p/W = 1 by construction
         probabilities=probabilities,
-        value_weights=scale * (unwhiten @ dual),
+        value_weights=scale * (constraint.mapping @ dual),
         temperature=scale * temperature,
         kl=kl,
         kl_bound=kl_bound,
         bound_active=bool(abs(kl - kl_bound) <= 0.01 * kl_bound),
-        feature_gap=float(np.max(np.abs(probabilities @ whitened), initial=0.0)),
+        feature_gap=float(np.max(np.abs(probabilities @ features), initial=0.0)),
         feature_gap_raw=float(np.max(np.abs((probabilities - base_weights) @ state_features), initial=0.0)),
-        rank_kept=whitened.shape[1],
+        rank_kept=features.shape[1],
         effective_samples=float(1 / np.sum(probabilities**2)),
         converged=converged,
         status=status,
@@ -179,6 +204,23 @@ def reps_weights_by_state(
     )
 
 
+def advantages(q_values: np.ndarray, constraint: WhitenedFeatures | np.ndarray, base_weights: np.ndarray) -> np.ndarray:
+    """Aᵢ = Qᵢ − V(sᵢ) with V the regression of Q on the constraint's features under W; shape (N,).
+
+    The limit of REPS at small bounds: p − W → √(2ε/E[A²])·W·A.
+
+    Args:
+      q_values: Qᵢ, shape (N,).
+      constraint: the whitened features, or the number of each sample's state where it is to hold for each.
+      base_weights: Wᵢ, shape (N,).
+    """
+    if isinstance(constraint, WhitenedFeatures):
+        centred = q_values - base_weights @ q_values
+        return centred - constraint.features @ (constraint.features.T @ (base_weights * centred))
+    visits = np.bincount(constraint, weights=base_weights)
+    return q_values - (np.bincount(constraint, weights=base_weights * q_values) / visits)[constraint]
+
+
 def _check(q_values: np.ndarray, state_features: np.ndarray, base_weights: np.ndarray, kl_bound: float) -> None:
     size = len(q_values)
     if q_values.shape != (size,) or base_weights.shape != (size,) or state_features.shape[:1] != (size,):
@@ -193,18 +235,6 @@ def _check(q_values: np.ndarray, state_features: np.ndarray, base_weights: np.nd
             raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
     if np.any(base_weights <= 0) or abs(np.sum(base_weights) - 1) > 1e-6:
         raise ValueError(f"base_weights: expected positive entries with sum 1, got sum {np.sum(base_weights)}")
-
-
-def _whiten(features: np.ndarray, base_weights: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Centred features of unit variance under W, (N, r), and the (D, r) matrix that maps to them."""
-    centred = features - base_weights @ features
-    covariance = centred.T @ (centred * base_weights[:, None])
-    values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
-    keep = values > max(values[-1], 0.0) * tolerance**2
-    if not np.any(keep) or values[-1] <= 1e-24:
-        return np.zeros((len(features), 0)), np.zeros((features.shape[1], 0))
-    mapping = vectors[:, keep] / np.sqrt(values[keep])
-    return centred @ mapping, mapping
 
 
 def _solve_dual(

@@ -70,12 +70,13 @@ class ConstantBound:
 class ConfidenceBound:
     """As large a share of the largest bound as the posterior is sure of the gain that the update promises.
 
-    Each draw of the utility has a Q-function of its own (LSTD is linear in the utility), and REPS's weights p for the
-    mean Q promise it a gain of G = Σ (pᵢ − Wᵢ)Qᵢ. An update of relative length s gains about s·G and a draw regrets
-    what it loses, so that of all s in [0, 1] the one that maximises E[sG] − ½E[(sG)²]/E[G] is the *signal*
-    s = E[G]²/(E[G]² + Var[G]). KL grows with the square of the length: the bound is s² times the largest. It asks
-    whether this update is safe, not whether the trajectories are easy to order. Where the mean expects no gain, or for
-    a posterior that has not converged, the bound is never raised over the run's own.
+    Each draw of the utility has a Q-function of its own (LSTD is linear in the utility), and the direction in which
+    REPS moves for the mean Q promises it a gain of G = Σ WᵢAᵢQᵢ (`ProposedUpdate.gains`). An update of relative length
+    s gains s·G and a draw regrets what it loses, so that of all s in [0, 1] the one that maximises
+    E[sG] − ½E[(sG)²]/E[G] is the *signal* s = E[G]²/(E[G]² + Var[G]). KL grows with the square of the length: the bound
+    is s² times the largest. It asks whether this update is safe, not whether the trajectories are easy to order, and
+    the answer does not depend on the units of the utility nor on any bound. Where the mean expects no gain, or for a
+    posterior that has not converged, the bound is never raised over the run's own.
 
     Attributes:
       largest: the bound when all draws expect the same gain, nats, > 0.
@@ -95,11 +96,11 @@ class ConfidenceBound:
         }
         if update.q_draws is None:
             return Bound(usual, "no posterior: the run's own bound", statistics)
-        gains = update.gains(usual)
+        gains = update.gains()
         square = float(np.mean(gains)) ** 2
         total = square + float(np.var(gains))
         signal = square / total if total > 0 and np.mean(gains) > 0 else 0.0
-        statistics |= {"signal": signal, "agreement": update.agreement(usual)}
+        statistics |= {"signal": signal, "agreement": float(np.mean(gains > 0))}
         bound = max(LEAST_BOUND, signal**2 * self.largest)
         reason = f"{statistics['agreement']:.0%} of the draws expect a gain, whose signal is {signal:.2f}"
         if not quality.converged and bound > usual:

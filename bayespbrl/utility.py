@@ -128,6 +128,11 @@ class LinearUtility:
         """Posterior draws of wᵀφ(s) of N states, all chains' in one, shape (S, N); `number` as of `draws`."""
         return self.draws(self.features(states), number=number).reshape(-1, len(states))
 
+    def utilities_and_draws(self, states: np.ndarray, *, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """`utilities` and `state_draws` of N states, (N,) and (S, N), from one evaluation of the features."""
+        features = self._same_width(self.features(states))
+        return features @ self.weights, self.draws(features, number=number).reshape(-1, len(states))
+
     @property
     def likelihood(self) -> Likelihood:
         """Of the next answer, as a function of the difference of two utilities wᵀψ; needs a posterior."""

@@ -81,6 +81,18 @@ def test_a_trajectory_is_worth_the_sum_of_its_states_in_the_mean_and_in_every_dr
         of_states = estimate.state_draws(states, number=number)
         np.testing.assert_allclose(drawn, of_states.reshape(len(drawn), 4, 6).sum(axis=2), atol=1e-10)
     assert len(drawn) == 1
+    with pytest.raises(ValueError, match="number: expected at least 1 draw, got 0"):
+        estimate.state_draws(states, number=0)
+
+
+def test_mean_and_draws_in_one_pass_are_those_of_two():
+    trajectories = walks()
+    one = estimate_utility(trajectories, PAIRS, LINE, method="posterior-mean", discount=1.0)
+    for estimate in (averaged(LINE, trajectories, PAIRS), one):
+        mean, draws = estimate.utilities_and_draws(STATES, number=20)
+        np.testing.assert_allclose(mean, estimate.utilities(STATES), rtol=1e-12)
+        np.testing.assert_allclose(draws, estimate.state_draws(STATES, number=20), rtol=1e-12)
+        assert draws.shape == (20, len(STATES))
 
 
 def test_each_draw_is_of_its_own_component():

@@ -123,9 +123,9 @@ def test_nothing_follows_a_terminal_state():
 def test_base_weights_are_policy_times_share_of_visits(monkeypatch):
     seen = {}
 
-    def spy(q_values, features, base_weights, *, kl_bound):
+    def spy(q_values, features, base_weights, **options):
         seen.update(features=features, base_weights=base_weights)
-        return reps_weights(q_values, features, base_weights, kl_bound=kl_bound)
+        return reps_weights(q_values, features, base_weights, **options)
 
     reps_weights = improvement.reps_weights
     monkeypatch.setattr(improvement, "reps_weights", spy)

@@ -3,7 +3,7 @@ import pytest
 import scipy.optimize
 
 from bayespbrl import reps
-from bayespbrl.reps import reps_weights, reps_weights_by_state
+from bayespbrl.reps import advantages, reps_weights, reps_weights_by_state, whitened
 
 
 def random_problem(states=6, actions=3, seed=0):
@@ -128,6 +128,29 @@ def test_a_solver_that_fails_leaves_the_policy_as_it_is_and_says_so(monkeypatch)
     assert "Maximum_Iterations" in solution.status
     np.testing.assert_allclose(solution.sample_weights, 1.0)
     assert solution.kl == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("problem", [random_problem, continuous_problem])
+def test_small_updates_follow_the_advantage(problem):
+    q_values, features, base = problem()
+    constraint = whitened(features, base)
+    advantage = advantages(q_values, constraint, base)
+    np.testing.assert_allclose([base @ advantage, *(base * advantage) @ constraint.features], 0, atol=1e-12)
+    solution = reps_weights(q_values, features, base, kl_bound=1e-6, constraint=constraint)
+    step = np.sqrt(2 * solution.kl / (base @ advantage**2)) * advantage
+    np.testing.assert_allclose(solution.sample_weights - 1, step, atol=0.01 * np.abs(step).max())
+    np.testing.assert_array_equal(
+        solution.probabilities, reps_weights(q_values, features, base, kl_bound=1e-6).probabilities
+    )
+
+
+def test_the_advantage_state_by_state_is_that_of_one_hot_features():
+    q_values, features, base = random_problem()
+    np.testing.assert_allclose(
+        advantages(q_values, features.argmax(axis=1), base),
+        advantages(q_values, whitened(features, base), base),
+        atol=1e-10,
+    )
 
 
 def by_state(problem):

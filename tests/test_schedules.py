@@ -38,6 +38,16 @@ def test_the_gain_of_the_mean_itself_is_what_reps_promises_and_grows_with_the_bo
     assert update.agreement(0.2) == pytest.approx(2 / 3)
 
 
+def test_the_gain_of_the_smallest_updates_is_the_limit_of_the_others():
+    rng = np.random.default_rng(4)
+    update = proposed(proposed().q_values[:, None] + rng.normal(size=(NUMBER, 12)))
+    direction, small = update.gains(), update.gains(1e-6)
+    np.testing.assert_allclose(direction / direction[0], small / small[0], rtol=0.01)
+    assert update.agreement() == update.agreement(1e-6)
+    signals = [ConfidenceBound()(situation(update, usual=usual)).statistics["signal"] for usual in (0.1, 1.0)]
+    assert signals[0] == signals[1] == pytest.approx(np.mean(small) ** 2 / np.mean(small**2), rel=0.01)
+
+
 def test_certain_draws_allow_the_largest_bound_and_draws_at_odds_the_least():
     mean = proposed().q_values
     sure = ConfidenceBound()(situation(proposed(np.column_stack([mean] * 10))))
