@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial, reduce
+from functools import cached_property, reduce
 from operator import add
 from typing import Any
 
@@ -86,11 +86,12 @@ class ProposedUpdate:
     def solve(self, kl_bound: float) -> RepsSolution:
         """REPS for the mean Q at this bound (eqs. 11-13); each bound is solved once."""
         if kl_bound not in self.solved:
-            if isinstance(self.constraint, WhitenedFeatures):
-                solve = partial(reps_weights, constraint=self.constraint)
-            else:
-                solve = reps_weights_by_state
-            self.solved[kl_bound] = solve(self.q_values, self.state_features, self.base_weights, kl_bound=kl_bound)
+            problem = (self.q_values, self.state_features, self.base_weights)
+            self.solved[kl_bound] = (
+                reps_weights(*problem, kl_bound=kl_bound, constraint=self.constraint)
+                if isinstance(self.constraint, WhitenedFeatures)
+                else reps_weights_by_state(*problem, kl_bound=kl_bound)
+            )
         return self.solved[kl_bound]
 
     def gains(self, kl_bound: float | None = None) -> np.ndarray:
