@@ -14,21 +14,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.special import softmax
 
+from bayespbrl.evidence import STEEPNESS_MULTIPLES, number_of_bandwidths, rescaled
 from bayespbrl.models.hyperparameters import Candidate, fit_candidate
 from bayespbrl.models.posterior import GaussianFit
 from bayespbrl.preferences import pair_differences
 from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility import (
-    STEEPNESS_MULTIPLES,
-    LinearUtility,
-    StateFeatures,
-    compared,
-    number_of_bandwidths,
-    rescaled,
-    scaled_differences,
-)
+from bayespbrl.utility import LinearUtility, StateFeatures, compared, scaled_differences
 
-# Of the bandwidths as given, in each state dimension; coarser than those that `utility.choose_hyperparameters` climbs
+# Of the bandwidths as given, in each state dimension; coarser than those that `evidence.choose_hyperparameters` climbs
 # over, for an average has no need of a maximum.
 BANDWIDTH_MULTIPLES = (0.5, 1.4, 4.0)
 MOST_BANDWIDTHS = 27  # beyond three dimensions, so many points of the grid, drawn at random
@@ -117,7 +110,7 @@ def average_utility(
 
     Args:
       chosen: the estimate with the setting of highest evidence.
-      trajectories, pairs, features, …: as of `utility.choose_hyperparameters`; at least one pair.
+      trajectories, pairs, features, …: as of `evidence.choose_hyperparameters`; at least one pair.
       seed: of the draws, and of the settings where there are too many.
     """
     rng = np.random.default_rng([seed, 2])

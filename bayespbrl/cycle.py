@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from bayespbrl import averaging, events, improvement, queries, rollouts, schedules, utility
+from bayespbrl import averaging, events, evidence, improvement, queries, rollouts, schedules, utility
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
@@ -268,7 +268,7 @@ class Learner:
             estimate=estimate,
         )
 
-    def _estimate(self) -> tuple[Any, utility.HyperparameterChoice | None]:
+    def _estimate(self) -> tuple[Any, evidence.HyperparameterChoice | None]:
         """Step 1, after the answers have said which length scales they speak for."""
         settings, state = self.settings, self.state
         pairs = state.preferences.pairs
@@ -283,7 +283,7 @@ class Learner:
         seed = int(self._rng(FIT, state.iteration).integers(2**31))
         given, choice = {"features": features, **model}, None
         if settings.hyperparameters != "given" and settings.utility != "known-reward":
-            choice = utility.choose_hyperparameters(state.trajectories, pairs, features, **model, **fixed)
+            choice = evidence.choose_hyperparameters(state.trajectories, pairs, features, **model, **fixed)
             features = choice.features
             model = {"steepness": choice.steepness, "lapse_rate": choice.lapse_rate}
         estimate: Any = utility.estimate_utility(

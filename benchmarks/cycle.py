@@ -22,7 +22,7 @@ from typing import Any
 
 import jax
 
-from bayespbrl import Learner, ReturnExpert, features, lstd, models, policies, reps, rollouts, trajectories, utility
+from bayespbrl import Learner, ReturnExpert, evidence, features, lstd, models, policies, reps, rollouts, trajectories
 from bayespbrl.policies import batch, hyperparameter_search
 
 FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
@@ -32,7 +32,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
         trajectories.trajectory_features,
     ),
     "sampler": (models.sample_posterior,),
-    "evidence": (utility.choose_hyperparameters,),
+    "evidence": (evidence.choose_hyperparameters,),
     "linear program": (models.linear_program,),
     "LSTD": (lstd.transition_sums, lstd.solve_lstd),
     "dual": (reps.reps_weights, reps.reps_weights_by_state),

@@ -23,7 +23,7 @@ GROUPS = {
     "policies": ["policies"],
     "what flows round": ["trajectories", "features", "preferences", "experts"],
     "steps": ["utility", "improvement", "rollouts", "queries"],
-    "averaging": ["averaging"],
+    "evidence and averaging": ["evidence", "averaging"],
     "schedules": ["schedules"],
     "plain data": ["settings"],
     "memory": ["records"],
@@ -42,7 +42,7 @@ FLOWS = [*GROUND, "models", "policies", "what flows round"]
 LEARNED = [
     *FLOWS,
     "steps",
-    "averaging",
+    "evidence and averaging",
     "schedules",
     "plain data",
     "memory",
@@ -59,13 +59,13 @@ ALLOWED = {
     "policies": ["numerics"],
     "what flows round": ["numerics"],
     "steps": FLOWS,
-    "averaging": [*FLOWS, "steps"],
+    "evidence and averaging": [*FLOWS, "steps"],
     "schedules": [*FLOWS, "steps", "diagnostics"],
     "plain data": [],
     "memory": [],
     "events": ["what flows round"],
-    "cycle": [*FLOWS, "steps", "averaging", "schedules", "plain data", "events"],
-    "run directory": [*FLOWS, "steps", "averaging", "plain data", "memory", "events"],
+    "cycle": [*FLOWS, "steps", "evidence and averaging", "schedules", "plain data", "events"],
+    "run directory": [*FLOWS, "steps", "evidence and averaging", "plain data", "memory", "events"],
     "runs": [*LEARNED, "report"],  # `Run.report` calls it, and imports it when called
     "diagnostics": [*LEARNED, "trials"],
     "report": [*LEARNED, "diagnostics", "trials"],
@@ -75,6 +75,7 @@ ALLOWED = {
 }
 # These import each other.
 WITHIN = {
+    "evidence and averaging",
     "environments",
     "models",
     "policies",

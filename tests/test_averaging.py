@@ -5,11 +5,12 @@ import pytest
 
 from bayespbrl import Learner, ReturnExpert, cycle, queries
 from bayespbrl.averaging import BANDWIDTH_MULTIPLES, MOST_BANDWIDTHS, average_utility
+from bayespbrl.evidence import STEEPNESS_MULTIPLES, choose_hyperparameters
 from bayespbrl.features import OneHot, RadialBasis
 from bayespbrl.iteration_files import read_iteration
 from bayespbrl.runs import start
 from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility import STEEPNESS_MULTIPLES, choose_hyperparameters, estimate_utility
+from bayespbrl.utility import estimate_utility
 
 LINE = RadialBasis(np.linspace(-1, 1, 5)[:, None], np.array([0.4]), np.array([np.inf]), normalised=True)
 PAIRS = [(0, 1), (0, 2), (3, 2)]

@@ -9,10 +9,10 @@ import pytest
 import scipy.optimize
 
 from bayespbrl import utility
-from bayespbrl.features import OneHot, RadialBasis
+from bayespbrl.features import OneHot
 from bayespbrl.models.likelihoods import Logistic, Mixed, WithLapses, log_prob
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
-from bayespbrl.utility import KnownReward, choose_hyperparameters, estimate_utility
+from bayespbrl.utility import KnownReward, estimate_utility
 
 METHODS = ("posterior-mean", "most-likely", "posterior-draw", "linear-program")
 
@@ -225,31 +225,3 @@ def test_features_that_are_not_finite_are_refused():
 def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match=r"method: expected .*posterior-mean.*got 'median'"):
         estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="median", discount=0.9)
-
-
-def test_the_answers_choose_a_length_scale_in_each_dimension_of_the_state():
-    rng = np.random.default_rng(0)
-    walks = [rng.uniform(-1, 1, 2) + 0.02 * rng.normal(size=(3, 2)) for _ in range(80)]
-    trajectories = [Trajectory(walk, np.zeros((2, 1)), np.zeros(2)) for walk in walks]
-
-    def hidden(trajectory):  # ripples in the first dimension, flat in the second
-        return np.sin(6 * trajectory.states[1:, 0]).sum()
-
-    drawn = rng.permutation(80).reshape(40, 2).tolist()
-    pairs = [(i, j) if hidden(trajectories[i]) > hidden(trajectories[j]) else (j, i) for i, j in drawn]
-    features = RadialBasis(rng.uniform(-1, 1, (100, 2)), np.array([1.0, 1.0]), np.full(2, np.inf))
-    choice = choose_hyperparameters(trajectories, pairs, features, discount=0.9)
-    assert choice.bandwidth_multiples[0] < 1 < choice.bandwidth_multiples[1]
-    assert choice.gain > 3
-    np.testing.assert_allclose(choice.features.bandwidths, choice.bandwidth_multiples)
-    # what was not compared changes nothing
-    more = choose_hyperparameters([*trajectories, *trajectories], pairs, features, discount=0.9)
-    assert more.summary() == choice.summary()
-    # answers at odds with each other speak for lapses
-    wrong = [(j, i) if k % 4 == 0 else (i, j) for k, (i, j) in enumerate(pairs)]
-    assert choose_hyperparameters(trajectories, wrong, features, discount=0.9).lapse_rate > choice.lapse_rate
-
-
-def test_without_answers_the_choice_is_what_was_given():
-    choice = choose_hyperparameters(TRAJECTORIES, [], ONE_HOT, discount=0.9, steepness=3.0, lapse_rate=0.2)
-    assert (choice.steepness, choice.lapse_rate, choice.gain, choice.bandwidth_multiples) == (3.0, 0.2, 0.0, ())
