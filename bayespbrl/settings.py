@@ -7,12 +7,33 @@ from typing import Any
 UTILITIES = ("posterior-mean", "most-likely", "posterior-draw", "linear-program", "known-reward")
 WITHOUT_POSTERIOR = ("linear-program", "known-reward")
 QUERIES = ("highest-utility", "probably-better", "thompson", "information", "disagreement", "information-when-unsure")
-LIKELIHOODS = ("mixed", "logistic", "probit")
-EXPERTS = ("return", "terminal", "other")
-POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
-FEATURES = ("drawn", "other")
-SCHEDULES = ("constant", "confidence", "other")
-HYPERPARAMETERS = ("evidence", "given", "averaged")
+CHOICES = {
+    "utility": UTILITIES,
+    "likelihood": ("mixed", "logistic", "probit"),
+    "query": QUERIES,
+    "policy": ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other"),
+    "features": ("drawn", "other"),
+    "schedule": ("constant", "confidence", "other"),
+    "hyperparameters": ("evidence", "given", "averaged"),
+    "expert": ("return", "terminal", "other"),
+}
+POSITIVE: Any = (lambda value: value > 0, "a positive finite number")
+NOT_NEGATIVE: Any = (lambda value: value >= 0, "a non-negative finite number")
+NUMBERS = {
+    **dict.fromkeys(("kl_bound", "prior_scale", "steepness", "initial_action_scale"), POSITIVE),
+    **dict.fromkeys(("bandwidth_factor", "utility_bandwidth_factor"), POSITIVE),
+    **dict.fromkeys(("fixed_point_ridge", "projection_ridge"), NOT_NEGATIVE),
+    **dict.fromkeys(("lapse_rate", "discount"), (lambda value: 0 <= value < 1, "a number in [0, 1)")),
+    "trajectory_discount": (lambda value: 0 <= value <= 1, "a number in [0, 1]"),
+    "wrong_answers": (lambda value: 0 <= value <= 1, "a share in [0, 1]"),
+}
+LEAST = {
+    "seed": 0,
+    "trajectories_per_iteration": 2,
+    **dict.fromkeys(("iterations", "queries_per_iteration", "first_queries", "evaluation_episodes"), 1),
+    **dict.fromkeys(("centres", "update_states", "exploration_hold", "max_steps", "recent_iterations"), 1),
+}
+MAY_BE_NONE = ("trajectory_discount", "max_steps", "recent_iterations")
 
 
 @dataclass(frozen=True)
@@ -100,57 +121,29 @@ class Settings:
     wrong_answers: float = 0.0
 
     def __post_init__(self) -> None:
-        _one_of("utility", self.utility, UTILITIES)
-        _one_of("likelihood", self.likelihood, LIKELIHOODS)
-        _one_of("query", self.query, QUERIES)
-        if self.schedule == "confidence" and self.utility in WITHOUT_POSTERIOR:
-            raise ValueError(f"schedule: expected constant with {self.utility}, no posterior, got {self.schedule!r}")
-        if self.query != QUERIES[0] and self.utility in WITHOUT_POSTERIOR:
-            raise ValueError(f"query: expected {QUERIES[0]} with {self.utility}, no posterior, got {self.query!r}")
-        _one_of("policy", self.policy, POLICIES)
-        _one_of("features", self.features, FEATURES)
-        _one_of("schedule", self.schedule, SCHEDULES)
-        _one_of("hyperparameters", self.hyperparameters, HYPERPARAMETERS)
+        for name, choices in CHOICES.items():
+            _one_of(name, getattr(self, name), choices)
+        for name, (holds, expected) in NUMBERS.items():
+            if getattr(self, name) is not None or name not in MAY_BE_NONE:
+                _number(name, getattr(self, name), holds, expected)
+        for name, least in LEAST.items():
+            if getattr(self, name) is not None or name not in MAY_BE_NONE:
+                _whole(name, getattr(self, name), least)
+        if not isinstance(self.normalised_utility, bool):
+            raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")
+        self._check_together()
+
+    def _check_together(self) -> None:
+        """What one option asks of another."""
+        if self.utility in WITHOUT_POSTERIOR:
+            for name, usual in (("schedule", "constant"), ("query", QUERIES[0])):
+                value = getattr(self, name)
+                if value not in (usual, "other"):
+                    raise ValueError(f"{name}: expected {usual} with {self.utility}, no posterior, got {value!r}")
         if self.query == "information-when-unsure" and self.schedule != "confidence":
             raise ValueError(f"schedule: expected confidence with the query {self.query}, got {self.schedule!r}")
         if self.hyperparameters == "averaged" and self.utility != "posterior-mean":
             raise ValueError(f"utility: expected posterior-mean with averaged hyperparameters, got {self.utility!r}")
-        for name in (
-            "kl_bound",
-            "prior_scale",
-            "steepness",
-            "bandwidth_factor",
-            "utility_bandwidth_factor",
-            "initial_action_scale",
-        ):
-            _number(name, getattr(self, name), lambda value: value > 0, "a positive finite number")
-        for name in ("fixed_point_ridge", "projection_ridge"):
-            _number(name, getattr(self, name), lambda value: value >= 0, "a non-negative finite number")
-        _one_of("expert", self.expert, EXPERTS)
-        _number("wrong_answers", self.wrong_answers, lambda value: 0 <= value <= 1, "a share in [0, 1]")
-        for name in ("lapse_rate", "discount"):
-            _number(name, getattr(self, name), lambda value: 0 <= value < 1, "a number in [0, 1)")
-        if self.trajectory_discount is not None:
-            _number(
-                "trajectory_discount", self.trajectory_discount, lambda value: 0 <= value <= 1, "a number in [0, 1]"
-            )
-        for name in (
-            "iterations",
-            "queries_per_iteration",
-            "first_queries",
-            "evaluation_episodes",
-            "centres",
-            "update_states",
-        ):
-            _whole(name, getattr(self, name), 1)
-        if not isinstance(self.normalised_utility, bool):
-            raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")
-        _whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
-        _whole("exploration_hold", self.exploration_hold, 1)
-        _whole("seed", self.seed, 0)
-        for name in ("max_steps", "recent_iterations"):
-            if getattr(self, name) is not None:
-                _whole(name, getattr(self, name), 1)
         for name, limit in (
             ("queries_per_iteration", self.trajectories_per_iteration),
             ("first_queries", self.trajectories_per_iteration - 1),
