@@ -60,7 +60,12 @@ class WhitenedFeatures:
 
 
 def whitened(state_features: np.ndarray, base_weights: np.ndarray, *, rank_tolerance: float = 1e-3) -> WhitenedFeatures:
-    """Features (N, D) whitened under W, (N,); directions below `rank_tolerance` of the largest singular value go."""
+    """Features (N, D) whitened under W, (N,); directions below `rank_tolerance` of the largest singular value go.
+
+    Raises:
+      ValueError: entries that are not finite.
+    """
+    _check_finite("state_features", state_features)
     centred = state_features - base_weights @ state_features
     covariance = centred.T @ (centred * base_weights[:, None])
     values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
@@ -207,7 +212,7 @@ def reps_weights_by_state(
 def advantages(q_values: np.ndarray, constraint: WhitenedFeatures | np.ndarray, base_weights: np.ndarray) -> np.ndarray:
     """Aᵢ = Qᵢ − V(sᵢ) with V the regression of Q on the constraint's features under W; shape (N,).
 
-    The limit of REPS at small bounds: p − W → √(2ε/E[A²])·W·A.
+    The limit of REPS at small bounds: p − W → √(2ε/E[A²])·W·A. Zero where only rounding is left of it.
 
     Args:
       q_values: Qᵢ, shape (N,).
@@ -216,9 +221,12 @@ def advantages(q_values: np.ndarray, constraint: WhitenedFeatures | np.ndarray, 
     """
     if isinstance(constraint, WhitenedFeatures):
         centred = q_values - base_weights @ q_values
-        return centred - constraint.features @ (constraint.features.T @ (base_weights * centred))
-    visits = np.bincount(constraint, weights=base_weights)
-    return q_values - (np.bincount(constraint, weights=base_weights * q_values) / visits)[constraint]
+        advantage = centred - constraint.features @ (constraint.features.T @ (base_weights * centred))
+    else:
+        visits = np.bincount(constraint, weights=base_weights)
+        advantage = q_values - (np.bincount(constraint, weights=base_weights * q_values) / visits)[constraint]
+    rounding = not np.sqrt(base_weights @ advantage**2) > 1e-8 * np.max(np.abs(q_values))
+    return np.zeros_like(q_values) if rounding else advantage
 
 
 def _check(q_values: np.ndarray, state_features: np.ndarray, base_weights: np.ndarray, kl_bound: float) -> None:
@@ -231,10 +239,14 @@ def _check(q_values: np.ndarray, state_features: np.ndarray, base_weights: np.nd
     if not (np.isfinite(kl_bound) and kl_bound > 0):
         raise ValueError(f"kl_bound: expected a positive finite number, got {kl_bound}")
     for name, array in (("q_values", q_values), ("state_features", state_features), ("base_weights", base_weights)):
-        if not np.all(np.isfinite(array)):
-            raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
+        _check_finite(name, array)
     if np.any(base_weights <= 0) or abs(np.sum(base_weights) - 1) > 1e-6:
         raise ValueError(f"base_weights: expected positive entries with sum 1, got sum {np.sum(base_weights)}")
+
+
+def _check_finite(name: str, array: np.ndarray) -> None:
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
 
 
 def _solve_dual(

@@ -75,8 +75,8 @@ class ConfidenceBound:
     s gains s·G and a draw regrets what it loses, so that of all s in [0, 1] the one that maximises
     E[sG] − ½E[(sG)²]/E[G] is the *signal* s = E[G]²/(E[G]² + Var[G]). KL grows with the square of the length: the bound
     is s² times the largest. It asks whether this update is safe, not whether the trajectories are easy to order, and
-    the answer does not depend on the units of the utility nor on any bound. Where the mean expects no gain, or for a
-    posterior that has not converged, the bound is never raised over the run's own.
+    the answer does not depend on the units of the utility nor on any bound. Where the mean expects no gain the bound
+    is the least there is, and for a posterior that has not converged it is never raised over the run's own.
 
     Attributes:
       largest: the bound when all draws expect the same gain, nats, > 0.

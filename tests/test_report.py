@@ -25,6 +25,7 @@ from bayespbrl.diagnostics.report_answers import surprise_order
 from bayespbrl.diagnostics.report_evidence import read_evidence
 from bayespbrl.diagnostics.report_findings import figure
 from bayespbrl.iteration_files import read_iteration
+from bayespbrl.schedules import Bound
 from bayespbrl.trajectories import trajectory_features
 
 QUICK = {"iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
@@ -254,6 +255,25 @@ def test_every_figure_takes_axes_and_returns_them_and_every_table_is_a_data_set(
         assert draw(*arguments, axes, **options) is axes
         assert isinstance(axes, Axes)
         assert axes.has_data()
+
+
+def test_the_bound_of_a_first_iteration_can_be_seen():
+    table = xr.Dataset(
+        {name: ("iteration", [0.3]) for name in ("kl_bound", "kl", "kl_fitted_policy")}, {"iteration": [1]}
+    )
+    bound, *others = report_figures.plot_bound(table, Figure().subplots()).lines
+    assert bound.get_marker() != "None"
+    assert bound.get_zorder() > max(other.get_zorder() for other in others)
+
+
+def test_a_schedule_may_record_what_it_likes(tmp_path):
+    def clock(situation):
+        return Bound(0.3, "by the clock", {"iteration": float(situation.iteration), "kl": 0.5})
+
+    start(tmp_path / "run", schedule=clock, iterations=2).run(ReturnExpert())
+    page = write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "could not be made" not in page
+    assert "by the clock" in page
 
 
 # Warnings.

@@ -48,6 +48,22 @@ def test_the_gain_of_the_smallest_updates_is_the_limit_of_the_others():
     assert signals[0] == signals[1] == pytest.approx(np.mean(small) ** 2 / np.mean(small**2), rel=0.01)
 
 
+def test_a_q_that_is_constant_but_for_rounding_is_no_signal():
+    values = 50 * (1 + 1e-10 * np.random.default_rng(1).normal(size=NUMBER))
+    features, base = np.random.default_rng(2).normal(size=(NUMBER, 3)), np.full(NUMBER, 1 / NUMBER)
+    for constraint in (features, np.arange(NUMBER) // 2):
+        update = ProposedUpdate(values, constraint, base, q_draws=np.outer(values, [0.5, 1.0, 2.0]))
+        decision = ConfidenceBound()(situation(update))
+        assert (decision.kl_bound, decision.statistics["signal"]) == (LEAST_BOUND, 0.0)
+
+
+def test_features_of_the_constraint_that_are_not_finite_are_refused():
+    update = ProposedUpdate(np.arange(4.0), np.array([[0.0], [1.0], [np.nan], [2.0]]), np.full(4, 0.25), np.eye(4))
+    for use in (lambda: update.solve(0.3), update.gains):
+        with pytest.raises(ValueError, match="state_features: expected finite entries"):
+            use()
+
+
 def test_certain_draws_allow_the_largest_bound_and_draws_at_odds_the_least():
     mean = proposed().q_values
     sure = ConfidenceBound()(situation(proposed(np.column_stack([mean] * 10))))

@@ -79,10 +79,10 @@ def plot_entropy(table: xr.Dataset, axes: Axes) -> Axes:
     return axes
 
 
-def plot_column(table: xr.Dataset, name: str, axes: Axes) -> Axes:
-    """Any one number of each iteration."""
+def plot_column(table: xr.Dataset, name: str, axes: Axes, *, label: str | None = None) -> Axes:
+    """Any one number of each iteration; `label` is its own name unless told."""
     _series(table, axes, {name: name})
-    axes.set(ylabel=name.replace("_", " "))
+    axes.set(ylabel=(name if label is None else label).replace("_", " "))
     return axes
 
 
@@ -178,7 +178,7 @@ def _series(table: xr.Dataset, axes: Axes, names: dict[str, str], *, converged: 
     for number, (name, label) in enumerate(names.items()):
         look: dict[str, Any] = {"marker": "o", "markersize": 3.5, "color": f"C{number}"}
         if number == 0 and len(names) > 1:  # what the others are held against: on top, and they show through
-            look = {"linestyle": "--", "color": "0.2", "linewidth": 1.2, "zorder": 3}
+            look = {"linestyle": "--", "marker": "_", "markersize": 5, "color": "0.2", "linewidth": 1.2, "zorder": 3}
         axes.plot(iterations, table[name], label=label, **look)
         if converged is not None and (failed := table[converged].values == 0).any():
             at = table[name].values[failed]

@@ -129,8 +129,10 @@ def updates(evidence: Evidence, iterations: xr.Dataset) -> Section:
         text.append(f"What decided {label} in each iteration is in the table below.")
         numbers = [name for name in names if iterations[name].dtype.kind == "f" and iterations[name].notnull().any()]
         if numbers:
-            named = iterations[numbers].rename({name: name.removeprefix(group + " ") for name in numbers})
-            shown = [("", partial(figures.plot_column, named, name.removeprefix(group + " "))) for name in numbers[:4]]
+            shown = [
+                ("", partial(figures.plot_column, iterations, name, label=name.removeprefix(group + " ")))
+                for name in numbers[:4]
+            ]
             blocks.append(drawn(group, shown, f"By iteration: {label}.", f"{label} by iteration."))
         rows = [
             [str(int(iterations["iteration"][i])), *(cell(iterations[name].values[i]) for name in names)]
