@@ -4,10 +4,10 @@
 
 The first study is the one that the others are compared with. For each: the median and lower quartile of the value at
 some numbers of answers and at the end; how many trials are lost, which is to end below `--lost`; the answers at which
-the lower quartile of the relative value (specification, section 1: (value − floor) / (ceiling − floor)) reaches 0.95;
-and the median difference to the first study over the same seeds after as many answers as both have, with a 95 %
-bootstrap interval. A study is a directory of `bayespbrl trials` or its table. The floor is the random policy's value;
-the ceiling a number, or a study with the known reward, whose median it is.
+median and lower quartile of the relative value (specification, section 1: (value − floor) / (ceiling − floor)) first
+reach 0.95; and the median difference to the first study over the same seeds after as many answers as both have, with a
+95 % bootstrap interval. A study is a directory of `bayespbrl trials` or its table. The floor is the random policy's
+value; the ceiling a number, or a study with the known reward, whose median it is.
 """
 
 import argparse
@@ -81,14 +81,15 @@ def main() -> None:
         reached = options.floor + REACHED * (ceiling - options.floor)
         print(f"relative value {REACHED}: {reached:.4g}")
     columns = [answers for answers in COLUMNS if answers < studies[0].answers[-1]]
-    names = [f"after {answers}" for answers in columns] + ["at the end", "lost", "answers to 0.95", "paired difference"]
+    names = [f"after {answers}" for answers in columns]
+    names += ["at the end", "lost", "median at 0.95", "lower quartile at 0.95", "paired difference"]
     print("| study | trials | " + " | ".join(names) + " |")
     print("|---|" + "---|" * (len(names) + 1))
     for study in studies:
         cells = [study.at(answers) if answers <= study.answers[-1] else None for answers in columns]
         row = [summary(cell) for cell in [*cells, study.values[:, -1]]]
         row.append("–" if options.lost is None else str(int(np.sum(study.values[:, -1] < options.lost))))
-        row.append("–" if reached is None else study.answers_to(reached, 0.25))
+        row += ["–", "–"] if reached is None else [study.answers_to(reached, quantile) for quantile in (0.5, 0.25)]
         row.append("–" if study is studies[0] else paired(study, studies[0]))
         print(f"| {study.name} | {len(study.seeds)} | " + " | ".join(row) + " |")
 

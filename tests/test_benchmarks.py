@@ -69,8 +69,8 @@ def test_studies_are_compared_seed_by_seed(tmp_path):
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines[0] == "relative value 0.95: 22.32"  # 0.95 of the median of 22 and 25
     first, second, longer = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
-    assert first == ["first", "3", "12 [8]", "1", "never", "–"]
+    assert first == ["first", "3", "12 [8]", "1", "never", "never", "–"]
     # seeds 3 and 1 differ by 10 and 5, in the second study's order as in any other
-    assert second == ["second", "2", "23.5 [22.75]", "0", "4", "+7.5 [+5.0, +10.0]"]
+    assert second == ["second", "2", "23.5 [22.75]", "0", "4", "4", "+7.5 [+5.0, +10.0]"]
     # a longer study is compared with the first at the answers that both have
-    assert longer == ["longer", "2", "-999 [-999]", "2", "4", "+7.5 [+5.0, +10.0]"]
+    assert longer == ["longer", "2", "-999 [-999]", "2", "4", "4", "+7.5 [+5.0, +10.0]"]
