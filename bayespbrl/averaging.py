@@ -14,12 +14,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.special import softmax
 
-from bayespbrl.evidence import STEEPNESS_MULTIPLES, number_of_bandwidths, rescaled
+from bayespbrl.evidence import STEEPNESS_MULTIPLES, number_of_bandwidths, rescaled, rescaled_differences
 from bayespbrl.models.hyperparameters import Candidate, fit_candidate
 from bayespbrl.models.posterior import GaussianFit
-from bayespbrl.preferences import pair_differences
 from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility import LinearUtility, StateFeatures, compared, scaled_differences
+from bayespbrl.utility import LinearUtility, StateFeatures, compared, spacing
 
 # Of the bandwidths as given, in each state dimension; coarser than those that `evidence.choose_hyperparameters` climbs
 # over, for an average has no need of a maximum.
@@ -34,8 +33,9 @@ Table = Callable[[StateFeatures], np.ndarray]  # what one component's features a
 class AveragedUtility(LinearUtility):
     """A mixture over settings, round the one that the evidence speaks for most.
 
-    What the learner acts on is the mixture's: `utilities`, `step_utilities`, `trajectory_utilities`, `state_draws` and
-    `trajectory_draws`. All else is of that one setting, whose posterior was sampled and can be diagnosed.
+    What the learner acts on is the mixture's: `utilities`, `step_utilities`, `trajectory_utilities`, `state_draws`,
+    `trajectory_draws` and `utilities_and_draws`. All else is of that one setting, whose posterior was sampled and can be
+    diagnosed.
 
     Attributes:
       base: φ as given.
@@ -73,10 +73,7 @@ class AveragedUtility(LinearUtility):
         return lambda features: trajectory_features(trajectories, features, discount=self.discount)
 
     def _spaced(self, number: int | None) -> slice:
-        """At most `number` of the draws, evenly spaced."""
-        if number is not None and number < 1:
-            raise ValueError(f"number: expected at least 1 draw, got {number}")
-        return slice(None, None, None if number is None else -(-len(self.components) // number))
+        return slice(None, None, spacing(len(self.components), number))
 
     def _mixed(self, table: Table, draws: slice) -> tuple[np.ndarray, np.ndarray]:
         """The mean for each of n rows of `table`, (n,), and some draws, (S, n): one pass over the components."""
@@ -119,8 +116,7 @@ def average_utility(
     fits: list[list[GaussianFit]] = []
     scales = []
     for row in multiples:
-        sums = trajectory_features(shown, rescaled(features, row), discount=discount)
-        differences, scale = scaled_differences(pair_differences(rows, sums))
+        differences, scale = rescaled_differences(shown, rows, features, row, discount=discount)
         scales.append(scale)
         fits.append([])
         for relative in STEEPNESS_MULTIPLES:

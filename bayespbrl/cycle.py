@@ -24,7 +24,7 @@ QUERY_DRAWS = 500
 # And a schedule, for which every draw costs a column of LSTD: the spread of a gain is known within a tenth of itself.
 SCHEDULE_DRAWS = 100
 # From this signal of the schedule `confidence` on, `information-when-unsure` asks as the paper does. Chosen on the
-# SwingUp, seeds 100-119, the only value that was tried; RESULTS.md has how often signals are below it.
+# SwingUp, seeds 100-119, the only value that was tried there; RESULTS.md has how often signals are below it.
 SURE_SIGNAL = 0.6
 
 

@@ -77,8 +77,7 @@ def choose_hyperparameters(
     def candidate(point: tuple[float, ...]) -> Candidate:
         multiples, (relative_steepness, lapses) = point[:dimensions], point[dimensions:]
         if multiples not in differences:
-            sums = trajectory_features(shown, rescaled(features, multiples), discount=discount)
-            differences[multiples] = scaled_differences(pair_differences(rows, sums))[0]
+            differences[multiples] = rescaled_differences(shown, rows, features, multiples, discount=discount)[0]
         return Candidate(
             differences[multiples],
             prior_scale=prior_scale,
@@ -113,3 +112,16 @@ def number_of_bandwidths(features: StateFeatures) -> int:
 def rescaled(features: StateFeatures, multiples: ArrayLike) -> StateFeatures:
     """φ with `multiples` of its bandwidths, where it has any."""
     return features.rescaled(multiples) if isinstance(features, RadialBasis) else features
+
+
+def rescaled_differences(
+    shown: Sequence[Trajectory],
+    rows: Sequence[tuple[int, int]],
+    features: StateFeatures,
+    multiples: ArrayLike,
+    *,
+    discount: float,
+) -> tuple[np.ndarray, float]:
+    """`scaled_differences` of what was `compared`, with `multiples` of the bandwidths of φ."""
+    sums = trajectory_features(shown, rescaled(features, multiples), discount=discount)
+    return scaled_differences(pair_differences(rows, sums))

@@ -123,11 +123,12 @@ class Settings:
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():
             _one_of(name, getattr(self, name), choices)
+        left_out = [name for name in MAY_BE_NONE if getattr(self, name) is None]
         for name, (holds, expected) in NUMBERS.items():
-            if getattr(self, name) is not None or name not in MAY_BE_NONE:
+            if name not in left_out:
                 _number(name, getattr(self, name), holds, expected)
         for name, least in LEAST.items():
-            if getattr(self, name) is not None or name not in MAY_BE_NONE:
+            if name not in left_out:
                 _whole(name, getattr(self, name), least)
         if not isinstance(self.normalised_utility, bool):
             raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")

@@ -106,11 +106,8 @@ class LinearUtility:
             raise ValueError("draws: expected an estimate with a posterior, got one without")
         if features.ndim != 2 or features.shape[1] != len(self.weights):
             raise ValueError(f"features: expected shape (n, {len(self.weights)}), got {features.shape}")
-        if number is not None and number < 1:
-            raise ValueError(f"number: expected at least 1 draw, got {number}")
         weights = self.posterior.children["posterior"].to_dataset()["utility_weights"]
-        apart = 1 if number is None else -(-weights.shape[0] * weights.shape[1] // number)
-        return weights[:, ::apart].values @ features.T / self.scale
+        return weights[:, :: spacing(weights.shape[0] * weights.shape[1], number)].values @ features.T / self.scale
 
     def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
         """Posterior draws of wᵀψ(τ) of each trajectory, all chains' in one, shape (S, n); arguments of `draws`."""
@@ -157,6 +154,13 @@ def compared(
     numbers = sorted({number for pair in pairs for number in pair} or {0})
     row = {number: position for position, number in enumerate(numbers)}
     return [trajectories[number] for number in numbers], [(row[i], row[j]) for i, j in pairs]
+
+
+def spacing(total: int, number: int | None) -> int:
+    """How far apart at most `number` of `total` draws are, evenly spaced; 1 for None, which is all of them."""
+    if number is not None and number < 1:
+        raise ValueError(f"number: expected at least 1 draw, got {number}")
+    return 1 if number is None else -(-total // number)
 
 
 def scaled_differences(differences: np.ndarray) -> tuple[np.ndarray, float]:

@@ -21,6 +21,7 @@ from bayespbrl.averaging import AveragedUtility
 from bayespbrl.cycle import Learner
 from bayespbrl.improvement import QFunction, estimate_q
 from bayespbrl.trajectories import Trajectory, transitions
+from bayespbrl.utility import spacing
 
 # Quantiles of the intervals in the figures: half and nine tenths of the draws.
 INTERVALS = ((0.25, 0.75, 4.0), (0.05, 0.95, 1.2))
@@ -259,10 +260,8 @@ def thinned(estimate: Any, number: int) -> Any:
     Raises:
       ValueError: an estimate without a posterior; a number < 1.
     """
-    if number < 1:
-        raise ValueError(f"number: expected at least 1 draw, got {number}")
     sizes = _with_posterior(estimate).posterior.children["posterior"].sizes
-    apart = -(-sizes["chain"] * sizes["draw"] // number)
+    apart = spacing(sizes["chain"] * sizes["draw"], number)
     return replace(estimate, posterior=estimate.posterior.isel(draw=slice(None, None, apart)))
 
 
