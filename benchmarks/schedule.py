@@ -2,9 +2,9 @@
 
     python benchmarks/schedule.py [gridworld|bicycle|swing-up|…] [--iterations N] [--seed S] [--hyperparameters KIND]
 
-runs the same trial twice, so that the second compiles nothing, and after each update of the second does the same update
-once more with a constant bound, the one that was decided: same utility, same transitions, same random choices. Prints
-one JSON line: processor seconds of both and the ratio of the difference to all that the trial takes without it.
+runs a trial that does each update once more with a constant bound, the one that was decided: same utility, same
+transitions, same random choices. It does so twice, and the second time, which compiles nothing, is measured. Prints one
+JSON line: processor seconds of both kinds and the ratio of the difference to all that the trial takes without it.
 """
 
 import argparse

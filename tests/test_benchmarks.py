@@ -57,6 +57,14 @@ def test_the_seconds_of_the_steps_of_a_trial_add_up():
     assert all(any(f"  {step} " in row for row in table) for step in steps)
 
 
+def test_a_schedule_costs_what_updates_with_it_take_longer():
+    command = [sys.executable, str(BENCHMARKS / "schedule.py"), "gridworld", "--iterations", "1"]
+    result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert 0 < result["updates_without"] < result["seconds_without"]
+    longer = result["updates_with"] - result["updates_without"]
+    assert result["overhead"] == pytest.approx(longer / result["seconds_without"], abs=0.02 / result["seconds_without"])
+
+
 def test_studies_are_compared_seed_by_seed(tmp_path):
     curves = {"first": {1: [0, 10, 20], 2: [0, 0, 4], 3: [0, 10, 12]}, "second": {3: [0, 20, 22], 1: [10, 20, 25]}}
     curves["longer"] = {seed: [*values, -999] for seed, values in curves["second"].items()}
