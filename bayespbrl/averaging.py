@@ -34,8 +34,8 @@ class AveragedUtility(LinearUtility):
     """A mixture over settings, round the one that the evidence speaks for most.
 
     What the learner acts on is the mixture's: `utilities`, `step_utilities`, `trajectory_utilities`, `state_draws`,
-    `trajectory_draws` and `utilities_and_draws`. All else is of that one setting, whose posterior was sampled and can be
-    diagnosed.
+    `trajectory_draws` and `utilities_and_draws`. All else is of that one setting, whose posterior was sampled and can
+    be diagnosed.
 
     Attributes:
       base: φ as given.
