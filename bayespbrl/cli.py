@@ -40,6 +40,9 @@ Hyperparameters = Annotated[
 ]
 Iterations = Annotated[int | None, typer.Option(help="Cycles of the four steps.")]
 KLBound = Annotated[float | None, typer.Option("--kl-bound", help="Bound on each policy update, in nats.")]
+UpdatesPerIteration = Annotated[
+    int | None, typer.Option(help="Policy updates from the same trajectories and answers; the paper's is 1.")
+]
 Likelihood = Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or probit.")]
 PriorScale = Annotated[float | None, typer.Option(help="Prior standard deviation of a utility weight.")]
 Steepness = Annotated[float | None, typer.Option(help="Of the likelihood, in units of the largest difference.")]
@@ -66,6 +69,7 @@ def run(
     hyperparameters: Hyperparameters = None,
     iterations: Iterations = None,
     kl_bound: KLBound = None,
+    updates_per_iteration: UpdatesPerIteration = None,
     likelihood: Likelihood = None,
     prior_scale: PriorScale = None,
     steepness: Steepness = None,
@@ -119,6 +123,7 @@ def trials(
     hyperparameters: Hyperparameters = None,
     iterations: Iterations = None,
     kl_bound: KLBound = None,
+    updates_per_iteration: UpdatesPerIteration = None,
     likelihood: Likelihood = None,
     prior_scale: PriorScale = None,
     steepness: Steepness = None,

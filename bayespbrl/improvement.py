@@ -17,6 +17,7 @@ from bayespbrl.reps import RepsSolution, WhitenedFeatures, advantages, reps_weig
 from bayespbrl.trajectories import Transitions
 
 ROWS_AT_A_TIME = 16_384
+NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,15 @@ class QFunction:
 
 @dataclass(frozen=True)
 class Improvement:
-    """A policy update and what really happened in it.
+    """A better policy and what really happened on the way to it.
 
     Attributes:
       policy: the new policy.
-      q_function: the estimate of Q under the old policy that it follows.
-      reps: sample weights, temperature, KL reached against its bound, feature gaps, rank kept, effective samples.
-      kl_fitted_policy: mean KL of the fitted policy from the old one over the states of the update, nats.
+      q_function: the estimate of Q that the last update follows, under the policy before it.
+      reps: of the last update: sample weights, temperature, KL reached against its bound, feature gaps, rank kept,
+        effective samples.
+      updates: how many there were.
+      kl_fitted_policy: mean KL of the new policy from the one given over the states of the updates, nats.
       entropy: mean entropy of the fitted policy over the same states, nats.
       action_standard_deviation: mean of the fitted policy's over the same states, one number an action dimension, in
         the action's units; None for discrete actions.
@@ -53,6 +56,7 @@ class Improvement:
     policy: Any
     q_function: QFunction
     reps: RepsSolution
+    updates: int
     kl_fitted_policy: float
     entropy: float
     action_standard_deviation: tuple[float, ...] | None
@@ -125,10 +129,11 @@ def improve(
     discount: float,
     fixed_point_ridge: float,
     projection_ridge: float,
+    updates: int = 1,
     visited: np.ndarray | None = None,
     utility_draws: np.ndarray | None = None,
 ) -> Improvement:
-    """One policy update of actor-critic REPS from all observed transitions.
+    """A better policy by actor-critic REPS from all observed transitions.
 
     Args:
       policy: the current policy.
@@ -140,6 +145,9 @@ def improve(
       state_action_features: φ(s, a) of Q.
       kl_bound: ε, nats; or what decides on it, once it has seen what updates would do.
       discount, fixed_point_ridge, projection_ridge: of LSTD.
+      updates: at most so many with the same bound, each with the Q of the policy that the one before it left. There is
+        another while the policy has moved by less than `NEARLY` of the bound: a policy that smooths over its samples
+        follows their weights a part of the way only. 1 is the paper's.
       visited: states of the policy update, shape (n, S) or (n,); those of all transitions when None. LSTD always has
         all transitions.
       utility_draws: the utilities under each of S posterior draws, shape (N, S): LSTD is linear in them, so that they
@@ -152,24 +160,59 @@ def improve(
     """
     if utilities.shape != (len(steps),) or not np.all(np.isfinite(utilities)):
         raise ValueError(f"utilities: expected {len(steps)} finite numbers, got shape {utilities.shape} or NaN")
-    next_key, fresh_key = jax.random.split(key)
-    q_functions = estimate_q(
-        policy,
-        steps,
-        utilities if utility_draws is None else np.column_stack([utilities, utility_draws]),
-        key=next_key,
-        action_space=action_space,
-        features=state_action_features,
-        discount=discount,
-        fixed_point_ridge=fixed_point_ridge,
-        projection_ridge=projection_ridge,
-    )
     states, visits = _visited(steps.states if visited is None else visited)
+    # the draws are there for whoever decides on the bound, which is decided once
+    columns = utilities if utility_draws is None else np.column_stack([utilities, utility_draws])
+    improved, bound = policy, kl_bound
+    for number in range(updates):
+        next_key, fresh_key = jax.random.split(jax.random.fold_in(key, number) if number else key)
+        q_functions = estimate_q(
+            improved,
+            steps,
+            columns,
+            key=next_key,
+            action_space=action_space,
+            features=state_action_features,
+            discount=discount,
+            fixed_point_ridge=fixed_point_ridge,
+            projection_ridge=projection_ridge,
+        )
+        proposed, samples = _proposed(improved, q_functions, states, visits, fresh_key, action_space, state_features)
+        bound = bound(proposed) if callable(bound) else bound
+        reps = proposed.solve(bound)
+        improved = improved.fit(*samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)
+        moved = float(visits @ improved.kl_divergence(policy, states))
+        columns = utilities
+        if moved >= NEARLY * bound:
+            break
+    return Improvement(
+        policy=improved,
+        q_function=replace(q_functions, weights=q_functions.weights.reshape(len(q_functions.weights), -1)[:, 0]),
+        reps=reps,
+        updates=number + 1,
+        kl_fitted_policy=moved,
+        entropy=float(visits @ entropies(improved, states)),
+        action_standard_deviation=None
+        if is_discrete(improved)
+        else tuple((visits @ improved.action_standard_deviation(states)).tolist()),
+    )
+
+
+def _proposed(
+    policy: Any,
+    q_functions: QFunction,
+    states: np.ndarray,
+    visits: np.ndarray,
+    key: jax.Array,
+    action_space: Space,
+    state_features: Callable[[np.ndarray], np.ndarray],
+) -> tuple[ProposedUpdate, tuple[np.ndarray, np.ndarray]]:
+    """What an update would do, and the states and actions of its samples."""
     if is_discrete(policy):
         rows, actions, base_weights = _all_actions(policy, states, visits)
     else:
         rows, base_weights = np.arange(len(states)), visits
-        actions = sample_actions(policy, fresh_key, states)
+        actions = sample_actions(policy, key, states)
     # Q is of the action that the environment would see; the fit is of the action that the policy drew, because
     # fitting clipped ones would shrink the policy at every update
     q_values = q_functions(states[rows], clipped(actions, action_space)).reshape(len(rows), -1)
@@ -181,20 +224,9 @@ def improve(
         q_values[:, 0],
         rows if each_state else state_features(states)[rows],
         base_weights,
-        None if utility_draws is None else q_values[:, 1:],
+        q_values[:, 1:] if q_values.shape[1] > 1 else None,
     )
-    reps = update.solve(kl_bound(update) if callable(kl_bound) else kl_bound)
-    fitted = policy.fit(states[rows], actions, reps.sample_weights, rng=rng, base_weights=base_weights)
-    return Improvement(
-        policy=fitted,
-        q_function=replace(q_functions, weights=q_functions.weights.reshape(len(q_functions.weights), -1)[:, 0]),
-        reps=reps,
-        kl_fitted_policy=float(visits @ fitted.kl_divergence(policy, states)),
-        entropy=float(visits @ entropies(fitted, states)),
-        action_standard_deviation=None
-        if is_discrete(fitted)
-        else tuple((visits @ fitted.action_standard_deviation(states)).tolist()),
-    )
+    return update, (states[rows], actions)
 
 
 def is_discrete(policy: Any) -> bool:

@@ -30,8 +30,11 @@ NUMBERS = {
 LEAST = {
     "seed": 0,
     "trajectories_per_iteration": 2,
+    "updates_per_iteration": 1,
     **dict.fromkeys(("iterations", "queries_per_iteration", "first_queries", "evaluation_episodes"), 1),
-    **dict.fromkeys(("centres", "update_states", "exploration_hold", "max_steps", "recent_iterations"), 1),
+    **dict.fromkeys(
+        ("centres", "update_states", "exploration_hold", "max_steps", "recent_iterations", "updates_per_iteration"), 1
+    ),
 }
 MAY_BE_NONE = ("trajectory_discount", "max_steps", "recent_iterations")
 
@@ -61,7 +64,7 @@ class Settings:
       seed: of every random choice of the run.
       query: which of the new trajectories are asked about; `highest-utility` is the paper's rule, the others look at
         the posterior. `information-when-unsure` is the paper's rule while the schedule `confidence` finds a signal of
-        0.6 or more; with less it asks for the most information about any trajectory that was never compared.
+        0.75 or more; with less it asks for the most information about any trajectory that was never compared.
       trajectories_per_iteration: N.
       queries_per_iteration, first_queries: M, in later iterations and in the first.
       discount: γ.
@@ -74,6 +77,8 @@ class Settings:
       max_steps: steps an episode; None for the environment's own limit.
       centres: radial basis functions of each kind of feature.
       bandwidth_factor: multiplies the median rule for the features of Q and V.
+      updates_per_iteration: updates of the policy from the same trajectories and utility, at most, until it has moved
+        by the bound; each has the Q of the policy that the one before it left. 1 is the paper's.
       recent_iterations: the policy update takes the states of so many last iterations; None for those of all. LSTD
         always has all transitions.
       update_states: of these states the policy update takes so many at most, drawn at random, where they are
@@ -111,6 +116,7 @@ class Settings:
     max_steps: int | None = None
     centres: int = 300
     bandwidth_factor: float = 1.0
+    updates_per_iteration: int = 1
     recent_iterations: int | None = None
     update_states: int = 20_000
     exploration_hold: int = 1

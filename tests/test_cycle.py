@@ -310,6 +310,7 @@ def test_a_summary_says_how_the_iteration_went():
         assert summary["kl"] == pytest.approx(0.3, rel=0.01)
         # a little less than the weights' own: the policy keeps a least probability of every action
         assert 0.95 * 0.3 < summary["kl_fitted_policy"] < 0.3 * 1.001
+        assert summary["updates"] == 1
         assert summary["bound_active"]
         assert summary["feature_gap"] < 1e-6
         assert 0 < summary["rank_kept"] <= 25

@@ -255,6 +255,61 @@ def test_discrete_actions_in_continuous_states_leave_every_state_its_weight():
     assert chances[1] < 0.2
 
 
+def moved_so_far(policies, states):
+    return [float(np.mean(policy.kl_divergence(policies[0], states))) for policy in policies]
+
+
+def test_further_updates_go_on_from_the_policy_and_the_q_of_the_last_until_it_has_moved_by_the_bound():
+    rng = np.random.default_rng(2)
+    states = rng.uniform(-1, 1, size=(500, 2))
+    first = LinearGaussianPolicy.initial(OBSERVATIONS, FORCES, initial_scale=0.2)
+    actions = improvement.clipped(sample_actions(first, jax.random.key(0), states), FORCES)
+    # what an action is worth depends on what the policy does in the state that it leads to
+    steps = Transitions(states, actions, np.roll(states, 1, axis=0), np.zeros(500), np.zeros(500, bool))
+    # and most of what is best in a state is nothing that a linear policy can do
+    best = 0.5 * states[:, 0] + np.sign(states[:, 0] * states[:, 1])
+    utilities = -((actions[:, 0] - best) ** 2)
+    asked = []
+
+    def decide(update):
+        asked.append(update.q_draws)
+        return 0.5
+
+    options = {
+        "action_space": FORCES,
+        "state_features": lambda s: np.column_stack([s, s**2]),
+        "state_action_features": lambda s, a: np.column_stack(
+            [a**2, a * s[:, :1], a[:, 0] * np.sign(s[:, 0] * s[:, 1]), s**2]
+        ),
+        "discount": 0.5,
+    }
+    one_by_one, chain, key = np.random.default_rng(1), [first], jax.random.key(1)
+    for number in range(3):
+        turn = jax.random.fold_in(key, number) if number else key
+        last = improve(chain[-1], steps, utilities, kl_bound=0.5, key=turn, rng=one_by_one, **options)
+        chain.append(last.policy)
+    moved = moved_so_far(chain, states)
+    assert moved[1] < moved[2]
+    together = improve(first, steps, utilities, kl_bound=decide, updates=2, utility_draws=utilities[:, None], **options)
+    assert len(asked) == 1  # the bound is that of the iteration
+    assert asked[0].shape == (500, 1)
+    assert together.updates == 2
+    assert together.kl_fitted_policy == pytest.approx(moved[2])
+    np.testing.assert_allclose(together.policy.kl_divergence(chain[2], states), 0, atol=1e-9)
+    before = improve(chain[1], steps, utilities, kl_bound=0.5, key=jax.random.fold_in(key, 1), **options)
+    np.testing.assert_allclose(together.q_function.weights, before.q_function.weights)
+    enough = next(number for number in range(1, 4) if moved[number] >= improvement.NEARLY * 0.5 or number == 3)
+    assert improve(first, steps, utilities, kl_bound=0.5, updates=3, **options).updates == enough
+    assert improve(first, steps, utilities, kl_bound=0.01, updates=3, **options).kl_fitted_policy < 0.03
+
+
+def test_a_policy_that_follows_the_weights_takes_one_update_whatever_is_allowed():
+    steps, utilities = random_steps()
+    once, often = (improve(random_policy(), steps, utilities, updates=number) for number in (1, 5))
+    assert once.updates == often.updates == 1
+    np.testing.assert_array_equal(once.policy.table, often.policy.table)
+
+
 def test_continuous_actions_are_kept_within_the_bounds_and_discrete_ones_as_they_are():
     np.testing.assert_array_equal(improvement.clipped(np.array([[-5.0], [0.3], [5.0]]), FORCES), [[-2], [0.3], [1]])
     np.testing.assert_array_equal(improvement.clipped(np.array([0, 2]), Discrete(3)), [0, 2])

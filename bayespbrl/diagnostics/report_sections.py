@@ -182,6 +182,7 @@ def numbers(iterations: xr.Dataset) -> Section:
         "kl_bound": "bound",
         "kl": "KL",
         "kl_fitted_policy": "KL fitted",
+        "updates": "updates",
         "temperature": "temperature",
         "entropy": "entropy",
         "rhat_max": "R̂",

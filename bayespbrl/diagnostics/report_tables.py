@@ -21,6 +21,7 @@ MEASURED = (
     "bound_active",
     "kl",
     "kl_fitted_policy",
+    "updates",
     "effective_samples",
     "temperature",
     "reps_converged",

@@ -93,7 +93,8 @@ def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Caution]:
         found.append(
             Caution(
                 f"The fitted policy went less than a third as far as REPS asked for in {_which(tame)}.",
-                "The policy smooths the update. Harmless while the value rises; a larger --kl-bound takes it further.",
+                "The policy smooths the update. Harmless while the value rises; more updates an iteration "
+                "(--updates-per-iteration 3) or a larger --kl-bound take it further.",
             )
         )
     return found + _of_entropy(evidence, table)
