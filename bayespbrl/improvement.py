@@ -147,7 +147,8 @@ def improve(
       discount, fixed_point_ridge, projection_ridge: of LSTD.
       updates: at most so many with the same bound, each with the Q of the policy that the one before it left. There is
         another while the policy has moved by less than `NEARLY` of the bound: a policy that smooths over its samples
-        follows their weights a part of the way only. 1 is the paper's.
+        follows their weights a part of the way only. All but the first hold a continuous policy's spread. 1 is the
+        paper's.
       visited: states of the policy update, shape (n, S) or (n,); those of all transitions when None. LSTD always has
         all transitions.
       utility_draws: the utilities under each of S posterior draws, shape (N, S): LSTD is linear in them, so that they
@@ -180,7 +181,10 @@ def improve(
         proposed, samples = _proposed(improved, q_functions, states, visits, fresh_key, action_space, state_features)
         bound = bound(proposed) if callable(bound) else bound
         reps = proposed.solve(bound)
-        improved = improved.fit(*samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)
+        # Decision: further updates hold the policy's spread. Fitted anew each time it would narrow before the utility
+        # is known well enough (RESULTS.md, "More updates an iteration").
+        fit = getattr(improved, "fit_mean", improved.fit) if number else improved.fit
+        improved = fit(*samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)
         moved = float(visits @ improved.kl_divergence(policy, states))
         columns = utilities
         if moved >= NEARLY * bound:

@@ -78,7 +78,8 @@ class Settings:
       centres: radial basis functions of each kind of feature.
       bandwidth_factor: multiplies the median rule for the features of Q and V.
       updates_per_iteration: updates of the policy from the same trajectories and utility, at most, until it has moved
-        by the bound; each has the Q of the policy that the one before it left. 1 is the paper's.
+        by the bound; each has the Q of the policy that the one before it left, and all but the first hold a continuous
+        policy's spread. 1 is the paper's.
       recent_iterations: the policy update takes the states of so many last iterations; None for those of all. LSTD
         always has all transitions.
       update_states: of these states the policy update takes so many at most, drawn at random, where they are

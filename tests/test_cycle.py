@@ -489,6 +489,29 @@ def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch)
     assert [states.shape for states in seen] == [(200,)]  # discrete ones are counted, so that all are taken
 
 
+@pytest.mark.slow
+def test_the_bound_of_an_iteration_is_decided_once_and_followed_by_several_updates(monkeypatch):
+    asked = []
+
+    def cautious(situation):
+        asked.append((situation.iteration, situation.update.q_draws.shape[1]))
+        return 0.2
+
+    options = {"iterations": 3, "max_steps": 12, "centres": 20, "evaluation_episodes": 2, "hyperparameters": "given"}
+    runs = {
+        number: Learner("swing-up", seed=3, schedule=cautious, updates_per_iteration=number, **options)
+        for number in (1, 3)
+    }
+    once, often = (run.run(ReturnExpert()) for run in runs.values())
+    assert asked == 2 * [(1, 100), (2, 100), (3, 100)]
+    assert [summary["updates"] for summary in once.iterations] == [1, 1, 1]
+    assert max(summary["updates"] for summary in often.iterations) > 1
+    for summary in often.iterations:
+        assert summary["updates"] == 3 or summary["kl_fitted_policy"] >= improvement.NEARLY * 0.2
+    again = Learner("swing-up", seed=3, schedule=cautious, updates_per_iteration=3, **options).run(ReturnExpert())
+    assert fingerprint(again) == fingerprint(often)
+
+
 def test_compilations_do_not_grow_with_the_iterations():
     assert compilations_after(learner(iterations=1, max_steps=11), 0) > 0  # the counter counts
     assert compilations_after(learner(iterations=7, max_steps=11), 3) == 0

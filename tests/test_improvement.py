@@ -255,24 +255,20 @@ def test_discrete_actions_in_continuous_states_leave_every_state_its_weight():
     assert chances[1] < 0.2
 
 
-def moved_so_far(policies, states):
-    return [float(np.mean(policy.kl_divergence(policies[0], states))) for policy in policies]
-
-
-def test_further_updates_go_on_from_the_policy_and_the_q_of_the_last_until_it_has_moved_by_the_bound():
+def test_further_updates_go_on_from_the_last_with_the_spread_held_until_the_policy_has_moved_by_the_bound():
     rng = np.random.default_rng(2)
     states = rng.uniform(-1, 1, size=(500, 2))
     first = LinearGaussianPolicy.initial(OBSERVATIONS, FORCES, initial_scale=0.2)
     actions = improvement.clipped(sample_actions(first, jax.random.key(0), states), FORCES)
-    # what an action is worth depends on what the policy does in the state that it leads to
+    # what an action is worth depends on what the policy does in the state that it leads to, and most of what is best in
+    # a state is nothing that a linear policy can do
     steps = Transitions(states, actions, np.roll(states, 1, axis=0), np.zeros(500), np.zeros(500, bool))
-    # and most of what is best in a state is nothing that a linear policy can do
     best = 0.5 * states[:, 0] + np.sign(states[:, 0] * states[:, 1])
     utilities = -((actions[:, 0] - best) ** 2)
-    asked = []
+    key, asked = jax.random.key(1), []
 
     def decide(update):
-        asked.append(update.q_draws)
+        asked.append(update.q_draws.shape)
         return 0.5
 
     options = {
@@ -282,25 +278,26 @@ def test_further_updates_go_on_from_the_policy_and_the_q_of_the_last_until_it_ha
             [a**2, a * s[:, :1], a[:, 0] * np.sign(s[:, 0] * s[:, 1]), s**2]
         ),
         "discount": 0.5,
+        "kl_bound": 0.5,
     }
-    one_by_one, chain, key = np.random.default_rng(1), [first], jax.random.key(1)
-    for number in range(3):
-        turn = jax.random.fold_in(key, number) if number else key
-        last = improve(chain[-1], steps, utilities, kl_bound=0.5, key=turn, rng=one_by_one, **options)
-        chain.append(last.policy)
-    moved = moved_so_far(chain, states)
-    assert moved[1] < moved[2]
-    together = improve(first, steps, utilities, kl_bound=decide, updates=2, utility_draws=utilities[:, None], **options)
-    assert len(asked) == 1  # the bound is that of the iteration
-    assert asked[0].shape == (500, 1)
-    assert together.updates == 2
-    assert together.kl_fitted_policy == pytest.approx(moved[2])
-    np.testing.assert_allclose(together.policy.kl_divergence(chain[2], states), 0, atol=1e-9)
-    before = improve(chain[1], steps, utilities, kl_bound=0.5, key=jax.random.fold_in(key, 1), **options)
-    np.testing.assert_allclose(together.q_function.weights, before.q_function.weights)
-    enough = next(number for number in range(1, 4) if moved[number] >= improvement.NEARLY * 0.5 or number == 3)
-    assert improve(first, steps, utilities, kl_bound=0.5, updates=3, **options).updates == enough
-    assert improve(first, steps, utilities, kl_bound=0.01, updates=3, **options).kl_fitted_policy < 0.03
+    one = improve(first, steps, utilities, key=key, **options)
+    two, three = (
+        improve(first, steps, utilities, key=key, updates=number, utility_draws=utilities[:, None], **options)
+        for number in (2, 3)
+    )
+    second = improve(one.policy, steps, utilities, key=jax.random.fold_in(key, 1), **options)
+    assert (one.updates, two.updates) == (1, 2)
+    np.testing.assert_allclose(two.q_function.weights, second.q_function.weights, rtol=1e-9)
+    np.testing.assert_allclose(two.reps.sample_weights, second.reps.sample_weights, rtol=1e-6)
+    np.testing.assert_allclose(two.policy.coefficients, second.policy.coefficients, rtol=1e-6)
+    np.testing.assert_allclose(two.policy.factor, one.policy.factor, rtol=1e-9)
+    assert not np.allclose(second.policy.factor, one.policy.factor)
+    assert one.kl_fitted_policy < improvement.NEARLY * 0.5
+    assert one.kl_fitted_policy < two.kl_fitted_policy
+    assert two.kl_fitted_policy == pytest.approx(np.mean(two.policy.kl_divergence(first, states)))
+    assert three.updates == (2 if two.kl_fitted_policy >= improvement.NEARLY * 0.5 else 3)
+    improve(first, steps, utilities, updates=3, utility_draws=utilities[:, None], **(options | {"kl_bound": decide}))
+    assert asked == [(500, 1)]  # the bound is that of the iteration
 
 
 def test_a_policy_that_follows_the_weights_takes_one_update_whatever_is_allowed():

@@ -210,6 +210,10 @@ class GaussianProcessPolicy:
         stacked = {name: np.stack(values) for name, values in new.items()}
         return replace(self, fits=np.asarray(int(self.fits) + 1), **stacked)
 
+    def fit_mean(self, *samples: np.ndarray, **options: Any) -> Self:
+        """`fit` with the hyper-parameters held: noise and signal variance, bandwidths."""
+        return self.fit(*samples, hyperparameters="keep", **options)
+
     def _fit_output(
         self,
         output: int,

@@ -154,6 +154,10 @@ class LinearGaussianPolicy:
             factor=np.asarray(self.action_range)[:, None] * np.linalg.cholesky(covariance),
         )
 
+    def fit_mean(self, *samples: np.ndarray, **options: Any) -> Self:
+        """`fit` with the noise held."""
+        return replace(self.fit(*samples, **options), factor=self.factor)
+
     def _means(self, observations: np.ndarray) -> np.ndarray:
         observations = np.asarray(observations, dtype=np.float64)
         coefficients = np.asarray(self.coefficients)
