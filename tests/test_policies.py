@@ -137,6 +137,24 @@ def test_neither_the_number_of_observations_nor_a_new_fit_compiles_anything(kind
     assert sizes[0] == sizes[1] == sizes[2]
 
 
+@pytest.mark.parametrize("kind", ["linear", "diagonal", "process"], indirect=True)
+def test_a_fit_of_the_mean_holds_the_spread_and_follows_the_weights(kind, fitted):
+    rng = np.random.default_rng(6)
+    observations = some_observations(kind, 400, rng)
+    actions = sample_actions(fitted, jax.random.key(4), observations)
+    weights = np.exp(actions[:, 0])  # the larger, the better
+    weights /= weights.mean()
+    moved = fitted.fit_mean(observations, actions, weights, rng=np.random.default_rng(7))
+    held = ("factor",) if kind != "process" else ("noise_variance", "signal_variance", "bandwidths")
+    for name in held:
+        np.testing.assert_array_equal(getattr(moved, name), getattr(fitted, name))
+    after = sample_actions(moved, jax.random.key(5), observations)
+    before = sample_actions(fitted, jax.random.key(5), observations)
+    assert after[:, 0].mean() > before[:, 0].mean() + 0.1
+    deviations = [policy.action_standard_deviation(observations).mean(axis=0) for policy in (moved, fitted)]
+    np.testing.assert_allclose(*deviations, rtol=0.1)
+
+
 def test_a_policy_is_a_pytree(kind, fitted):
     leaves, structure = jax.tree.flatten(fitted)
     again = jax.tree.unflatten(structure, leaves)
