@@ -1,40 +1,20 @@
-"""Step 2: from a utility to a better policy: LSTD-Q, actor-critic REPS, policy fit (paper, "Step 2")."""
+"""Step 2, its actor: from Q to a better policy by actor-critic REPS and the policy fit (paper, "Step 2")."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
-from operator import add
+from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Box
 
-from bayespbrl.lstd import TransitionSums, solve_lstd, transition_sums
-from bayespbrl.policies import entropies, sample_actions
+from bayespbrl.policies import clipped, entropies, is_discrete, sample_actions
+from bayespbrl.q_function import QFunction, estimate_q
 from bayespbrl.reps import RepsSolution, WhitenedFeatures, advantages, reps_weights, reps_weights_by_state, whitened
 from bayespbrl.trajectories import Transitions
 
-ROWS_AT_A_TIME = 16_384
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
-
-
-@dataclass(frozen=True)
-class QFunction:
-    """Q(s, a) = [φ(s, a), 1]ᵀθ.
-
-    Attributes:
-      features: φ(s, a), from N states and N actions to (N, Q).
-      weights: θ, shape (Q + 1,), or (Q + 1, n) for n utilities side by side; the last row is the bias.
-    """
-
-    features: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    weights: np.ndarray
-
-    def __call__(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Q of N pairs, shape (N,), or (N, n)."""
-        return self.features(states, actions) @ self.weights[:-1] + self.weights[-1]
 
 
 @dataclass(frozen=True)
@@ -233,16 +213,6 @@ def _proposed(
     return update, (states[rows], actions)
 
 
-def is_discrete(policy: Any) -> bool:
-    """Whether a policy's actions can be enumerated."""
-    return hasattr(policy, "probabilities")
-
-
-def clipped(actions: np.ndarray, action_space: Space) -> np.ndarray:
-    """Continuous actions as the environment will see them; discrete ones as they are."""
-    return np.clip(actions, action_space.low, action_space.high) if isinstance(action_space, Box) else actions
-
-
 def _visited(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The states of the update and the share of visits of each: discrete ones are counted, not repeated."""
     if states.ndim > 1:
@@ -257,81 +227,3 @@ def _all_actions(policy: Any, states: np.ndarray, visits: np.ndarray) -> tuple[n
     rows, actions = np.nonzero(weights)
     base_weights = weights[rows, actions]
     return rows, actions, base_weights / np.sum(base_weights)
-
-
-def estimate_q(
-    policy: Any,
-    steps: Transitions,
-    utilities: np.ndarray,
-    *,
-    key: jax.Array,
-    action_space: Space,
-    features: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    discount: float,
-    fixed_point_ridge: float,
-    projection_ridge: float,
-) -> QFunction:
-    """LSTD-Q with a bias column, from every observed transition.
-
-    Args:
-      policy: whose Q.
-      steps: N transitions, under whatever policies.
-      utilities: uᵢ of each, shape (N,), or n of them side by side, (N, n).
-      key: for the fresh action in each next state, where actions cannot be enumerated.
-      action_space: bounds the fresh actions.
-      features: φ(s, a).
-      discount, fixed_point_ridge, projection_ridge: of LSTD.
-    """
-    steps, utilities, counts = _counted(steps, utilities)
-    following = None if is_discrete(policy) else clipped(sample_actions(policy, key, steps.next_states), action_space)
-
-    def sums(rows: slice) -> TransitionSums:
-        current = _with_bias(features(steps.states[rows], steps.actions[rows]))
-        if following is None:
-            successor = _expected_features(policy, steps.next_states[rows], features)
-        else:
-            successor = features(steps.next_states[rows], following[rows])
-        successor = _with_bias(successor)
-        successor[steps.terminal[rows]] = 0.0
-        repeats = np.sqrt(counts[rows])[:, None]  # a row times √n enters every Gram matrix as n rows
-        return transition_sums(current * repeats, successor * repeats, (utilities[rows].T * repeats[:, 0]).T)
-
-    # a block at a time: the features of all transitions would fill the memory of a long run
-    blocks = [slice(start, start + ROWS_AT_A_TIME) for start in range(0, len(steps), ROWS_AT_A_TIME)]
-    weights = solve_lstd(
-        reduce(add, map(sums, blocks)),
-        discount=discount,
-        fixed_point_ridge=fixed_point_ridge,
-        projection_ridge=projection_ridge,
-    )
-    return QFunction(features, weights)
-
-
-def _counted(steps: Transitions, utilities: np.ndarray) -> tuple[Transitions, np.ndarray, np.ndarray]:
-    """Discrete transitions once each, with the mean of their utilities and how often they occurred."""
-    if steps.states.ndim > 1 or steps.actions.ndim > 1:
-        return steps, utilities, np.ones(len(steps))
-    table = np.column_stack([steps.states, steps.actions, steps.next_states, steps.terminal])
-    _, first, inverse, counts = np.unique(table, axis=0, return_index=True, return_inverse=True, return_counts=True)
-    columns = utilities.reshape(len(utilities), -1).T
-    sums = [np.bincount(inverse.ravel(), weights=column) for column in columns]
-    means = (np.stack(sums) / counts).T.reshape(-1, *utilities.shape[1:])
-    unique = Transitions(
-        steps.states[first], steps.actions[first], steps.next_states[first], steps.rewards[first], steps.terminal[first]
-    )
-    return unique, means, counts.astype(float)
-
-
-def _expected_features(
-    policy: Any, states: np.ndarray, features: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """Σₐ π(a|s)φ(s, a). Decision: where actions can be enumerated, their expectation replaces one fresh sample."""
-    probabilities = policy.probabilities(states)
-    total = probabilities[:, :1] * features(states, np.zeros(len(states), dtype=np.int64))
-    for action in range(1, probabilities.shape[1]):
-        total += probabilities[:, action, None] * features(states, np.full(len(states), action))
-    return total
-
-
-def _with_bias(features: np.ndarray) -> np.ndarray:
-    return np.column_stack([features, np.ones(len(features))])

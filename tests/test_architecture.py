@@ -22,6 +22,7 @@ GROUPS = {
     "models": ["models"],
     "policies": ["policies"],
     "what flows round": ["trajectories", "features", "preferences", "experts"],
+    "critic": ["q_function"],
     "steps": ["utility", "improvement", "rollouts", "queries"],
     "evidence and averaging": ["evidence", "averaging"],
     "schedules": ["schedules"],
@@ -41,6 +42,7 @@ GROUND = ["numerics", "convergence", "environments"]
 FLOWS = [*GROUND, "models", "policies", "what flows round"]
 LEARNED = [
     *FLOWS,
+    "critic",
     "steps",
     "evidence and averaging",
     "schedules",
@@ -58,7 +60,8 @@ ALLOWED = {
     "models": ["numerics", "convergence"],
     "policies": ["numerics"],
     "what flows round": ["numerics"],
-    "steps": FLOWS,
+    "critic": FLOWS,
+    "steps": [*FLOWS, "critic"],
     "evidence and averaging": [*FLOWS, "steps"],
     "schedules": [*FLOWS, "steps", "diagnostics"],
     "plain data": [],
@@ -175,4 +178,4 @@ def test_the_rule_refuses_what_it_should():
     assert group_of("envs.gridworld") == "environments"
     assert group_of("environment") is None
     assert "steps" not in ALLOWED["steps"]
-    assert {"trajectories", "lstd", "reps"} <= ours("improvement")
+    assert {"trajectories", "q_function", "reps"} <= ours("improvement")

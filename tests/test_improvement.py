@@ -5,9 +5,16 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from bayespbrl import improvement
+from bayespbrl import improvement, q_function
 from bayespbrl.features import OneHot, StateActionProduct, draw_state_action_features
-from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, TabularPolicy, sample_actions
+from bayespbrl.policies import (
+    GaussianProcessPolicy,
+    LinearGaussianPolicy,
+    SoftmaxPolicy,
+    TabularPolicy,
+    clipped,
+    sample_actions,
+)
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
 
 STATES, ACTIONS, DISCOUNT = 6, 3, 0.9
@@ -56,8 +63,8 @@ def test_q_of_counted_steps_is_that_of_the_uncounted_ones(monkeypatch):
     steps, utilities = random_steps(terminated=True)
     utilities = utilities + 0.1 * np.random.default_rng(0).normal(size=len(steps))  # not a function of the state
     counted = improve(random_policy(), steps, utilities)
-    assert len(improvement._counted(steps, utilities)[0]) < len(steps) / 2
-    monkeypatch.setattr(improvement, "_counted", lambda steps, utilities: (steps, utilities, np.ones(len(steps))))
+    assert len(q_function._counted(steps, utilities)[0]) < len(steps) / 2
+    monkeypatch.setattr(q_function, "_counted", lambda steps, utilities: (steps, utilities, np.ones(len(steps))))
     uncounted = improve(random_policy(), steps, utilities)
     np.testing.assert_allclose(counted.q_function.weights, uncounted.q_function.weights, atol=1e-6)
     np.testing.assert_allclose(counted.policy.table, uncounted.policy.table, atol=1e-6)
@@ -83,11 +90,11 @@ def test_q_of_utilities_side_by_side_is_that_of_each_alone():
     others = np.random.default_rng(0).normal(size=(len(steps), 2))  # not a function of the state
     features = StateActionProduct(OneHot(STATES), ACTIONS)
     options = {"key": jax.random.key(1), "action_space": Discrete(ACTIONS), "features": features, **OPTIONS}
-    together = improvement.estimate_q(random_policy(), steps, np.column_stack([utilities, others]), **options)
+    together = q_function.estimate_q(random_policy(), steps, np.column_stack([utilities, others]), **options)
     states, actions = np.divmod(np.arange(STATES * ACTIONS), ACTIONS)
     for column, alone in enumerate([utilities, *others.T]):
-        q_function = improvement.estimate_q(random_policy(), steps, alone, **options)
-        np.testing.assert_allclose(together(states, actions)[:, column], q_function(states, actions), atol=1e-9)
+        by_itself = q_function.estimate_q(random_policy(), steps, alone, **options)
+        np.testing.assert_allclose(together(states, actions)[:, column], by_itself(states, actions), atol=1e-9)
     assert together(states, actions).shape == (STATES * ACTIONS, 3)
 
 
@@ -106,9 +113,9 @@ def test_q_is_the_same_however_many_transitions_are_taken_at_a_time(monkeypatch,
         (steps, utilities), space, policy = random_steps(terminated=True), Discrete(ACTIONS), random_policy()
         features = StateActionProduct(OneHot(STATES), ACTIONS)
     options = {"key": jax.random.key(1), "action_space": space, "features": features, **OPTIONS}
-    at_once = improvement.estimate_q(policy, steps, utilities, **options)(steps.states, steps.actions)
-    monkeypatch.setattr(improvement, "ROWS_AT_A_TIME", 7)
-    in_blocks = improvement.estimate_q(policy, steps, utilities, **options)(steps.states, steps.actions)
+    at_once = q_function.estimate_q(policy, steps, utilities, **options)(steps.states, steps.actions)
+    monkeypatch.setattr(q_function, "ROWS_AT_A_TIME", 7)
+    in_blocks = q_function.estimate_q(policy, steps, utilities, **options)(steps.states, steps.actions)
     np.testing.assert_allclose(in_blocks, at_once, atol=1e-6)
 
 
@@ -206,7 +213,7 @@ def test_a_continuous_policy_moves_towards_the_better_actions(kind):
     rng = np.random.default_rng(2)
     policy = kind.initial(OBSERVATIONS, FORCES, initial_scale=0.2)
     states = rng.uniform(-1, 1, size=(500, 2))
-    actions = improvement.clipped(sample_actions(policy, jax.random.key(0), states), FORCES)
+    actions = clipped(sample_actions(policy, jax.random.key(0), states), FORCES)
     steps = Transitions(states, actions, rng.uniform(-1, 1, (500, 2)), np.zeros(500), np.ones(500, bool))
     best = 0.5 * states[:, 0]
     before = np.mean((actions[:, 0] - best) ** 2)
@@ -259,7 +266,7 @@ def test_further_updates_go_on_from_the_last_with_the_spread_held_until_the_poli
     rng = np.random.default_rng(2)
     states = rng.uniform(-1, 1, size=(500, 2))
     first = LinearGaussianPolicy.initial(OBSERVATIONS, FORCES, initial_scale=0.2)
-    actions = improvement.clipped(sample_actions(first, jax.random.key(0), states), FORCES)
+    actions = clipped(sample_actions(first, jax.random.key(0), states), FORCES)
     # what an action is worth depends on what the policy does in the state that it leads to, and most of what is best in
     # a state is nothing that a linear policy can do
     steps = Transitions(states, actions, np.roll(states, 1, axis=0), np.zeros(500), np.zeros(500, bool))
@@ -308,5 +315,5 @@ def test_a_policy_that_follows_the_weights_takes_one_update_whatever_is_allowed(
 
 
 def test_continuous_actions_are_kept_within_the_bounds_and_discrete_ones_as_they_are():
-    np.testing.assert_array_equal(improvement.clipped(np.array([[-5.0], [0.3], [5.0]]), FORCES), [[-2], [0.3], [1]])
-    np.testing.assert_array_equal(improvement.clipped(np.array([0, 2]), Discrete(3)), [0, 2])
+    np.testing.assert_array_equal(clipped(np.array([[-5.0], [0.3], [5.0]]), FORCES), [[-2], [0.3], [1]])
+    np.testing.assert_array_equal(clipped(np.array([0, 2]), Discrete(3)), [0, 2])

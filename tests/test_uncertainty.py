@@ -24,7 +24,7 @@ from bayespbrl.diagnostics.uncertainty import (
     thinned,
 )
 from bayespbrl.features import OneHot
-from bayespbrl.improvement import estimate_q
+from bayespbrl.q_function import estimate_q
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
 from bayespbrl.utility import estimate_utility
 

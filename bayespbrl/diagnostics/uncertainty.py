@@ -19,7 +19,7 @@ from scipy.stats import rankdata
 
 from bayespbrl.averaging import AveragedUtility
 from bayespbrl.cycle import Learner
-from bayespbrl.improvement import QFunction, estimate_q
+from bayespbrl.q_function import QFunction, estimate_q
 from bayespbrl.trajectories import Trajectory, transitions
 from bayespbrl.utility import spacing
 

@@ -10,8 +10,9 @@ batch, actor             a policy at many observations, and at one
 from bayespbrl.policies.batch import entropies, log_probabilities, sample_actions
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
-from bayespbrl.policies.policy import Policy
+from bayespbrl.policies.policy import Policy, is_discrete
 from bayespbrl.policies.softmax import SoftmaxPolicy
+from bayespbrl.policies.spaces import clipped
 from bayespbrl.policies.tabular import TabularPolicy
 
 __all__ = [
@@ -20,7 +21,9 @@ __all__ = [
     "Policy",
     "SoftmaxPolicy",
     "TabularPolicy",
+    "clipped",
     "entropies",
+    "is_discrete",
     "log_probabilities",
     "sample_actions",
 ]

@@ -61,3 +61,8 @@ class Policy(Protocol):
           base_weights: Wᵢ, shape (N,), ≥ 0, of any sum; None for the uniform 1/N. Sample i counts with pᵢ = wᵢWᵢ.
         """
         ...
+
+
+def is_discrete(policy: Any) -> bool:
+    """Whether a policy's actions can be enumerated."""
+    return hasattr(policy, "probabilities")

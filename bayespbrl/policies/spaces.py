@@ -1,4 +1,4 @@
-"""What a policy reads off an observation or action space: the number of values, or the dimension, centre and range."""
+"""What an observation or action space says: the number of values, or the dimension, centre and range; its bounds."""
 
 import numpy as np
 from gymnasium import Space
@@ -29,3 +29,8 @@ def centre_and_range(name: str, space: Space) -> tuple[np.ndarray, np.ndarray]:
     if not np.all(high > low):
         raise ValueError(f"{name}: expected low < high in every dimension, got {space}")
     return (low + high) / 2, high - low
+
+
+def clipped(actions: np.ndarray, action_space: Space) -> np.ndarray:
+    """Continuous actions as the environment will see them; discrete ones as they are."""
+    return np.clip(actions, action_space.low, action_space.high) if isinstance(action_space, Box) else actions
