@@ -15,6 +15,7 @@ from bayespbrl.reps import RepsSolution, WhitenedFeatures, advantages, reps_weig
 from bayespbrl.trajectories import Transitions
 
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
+NOTHING = 1e-3  # of the bound; weights that have moved by less have nothing to gain
 
 
 @dataclass(frozen=True)
@@ -126,21 +127,23 @@ def improve(
       kl_bound: ε, nats; or what decides on it, once it has seen what updates would do.
       discount, fixed_point_ridge, projection_ridge: of LSTD.
       updates: at most so many with the same bound, each with the Q of the policy that the one before it left. There is
-        another while the policy has moved by less than `NEARLY` of the bound: a policy that smooths over its samples
-        follows their weights a part of the way only. All but the first hold a continuous policy's spread. 1 is the
-        paper's.
+        another while the policy has moved by less than `NEARLY` of the bound and REPS finds something to gain: a policy
+        that smooths over its samples follows their weights a part of the way only. All but the first hold the spread of
+        a policy with `fit_mean`. 1 is the paper's.
       visited: states of the policy update, shape (n, S) or (n,); those of all transitions when None. LSTD always has
         all transitions.
       utility_draws: the utilities under each of S posterior draws, shape (N, S): LSTD is linear in them, so that they
         cost no more solutions. None: only the utilities count.
 
     Raises:
-      ValueError: utilities that do not fit the transitions or are not finite.
+      ValueError: utilities that do not fit the transitions or are not finite; no update.
 
     Source: paper, step 2, eqs. 11-14.
     """
     if utilities.shape != (len(steps),) or not np.all(np.isfinite(utilities)):
         raise ValueError(f"utilities: expected {len(steps)} finite numbers, got shape {utilities.shape} or NaN")
+    if updates < 1:
+        raise ValueError(f"updates: expected at least 1, got {updates}")
     states, visits = _visited(steps.states if visited is None else visited)
     # the draws are there for whoever decides on the bound, which is decided once
     columns = utilities if utility_draws is None else np.column_stack([utilities, utility_draws])
@@ -163,11 +166,11 @@ def improve(
         reps = proposed.solve(bound)
         # Decision: further updates hold the policy's spread. Fitted anew each time it would narrow before the utility
         # is known well enough (RESULTS.md, "More updates an iteration").
-        fit = getattr(improved, "fit_mean", improved.fit) if number else improved.fit
+        fit = improved.fit_mean if number and hasattr(type(improved), "fit_mean") else improved.fit
         improved = fit(*samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)
         moved = float(visits @ improved.kl_divergence(policy, states))
         columns = utilities
-        if moved >= NEARLY * bound:
+        if moved >= NEARLY * bound or reps.kl < NOTHING * bound or not reps.converged:
             break
     return Improvement(
         policy=improved,

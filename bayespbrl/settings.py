@@ -32,9 +32,7 @@ LEAST = {
     "trajectories_per_iteration": 2,
     "updates_per_iteration": 1,
     **dict.fromkeys(("iterations", "queries_per_iteration", "first_queries", "evaluation_episodes"), 1),
-    **dict.fromkeys(
-        ("centres", "update_states", "exploration_hold", "max_steps", "recent_iterations", "updates_per_iteration"), 1
-    ),
+    **dict.fromkeys(("centres", "update_states", "exploration_hold", "max_steps", "recent_iterations"), 1),
 }
 MAY_BE_NONE = ("trajectory_discount", "max_steps", "recent_iterations")
 
@@ -78,8 +76,8 @@ class Settings:
       centres: radial basis functions of each kind of feature.
       bandwidth_factor: multiplies the median rule for the features of Q and V.
       updates_per_iteration: updates of the policy from the same trajectories and utility, at most, until it has moved
-        by the bound; each has the Q of the policy that the one before it left, and all but the first hold a continuous
-        policy's spread. 1 is the paper's.
+        by most of the bound, which holds for each of them; each has the Q of the policy that the one before it left,
+        and all but the first hold a continuous policy's spread. 1 is the paper's.
       recent_iterations: the policy update takes the states of so many last iterations; None for those of all. LSTD
         always has all transitions.
       update_states: of these states the policy update takes so many at most, drawn at random, where they are

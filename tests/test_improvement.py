@@ -288,9 +288,9 @@ def test_further_updates_go_on_from_the_last_with_the_spread_held_until_the_poli
         "kl_bound": 0.5,
     }
     one = improve(first, steps, utilities, key=key, **options)
-    two, three = (
+    two, many = (
         improve(first, steps, utilities, key=key, updates=number, utility_draws=utilities[:, None], **options)
-        for number in (2, 3)
+        for number in (2, 9)
     )
     second = improve(one.policy, steps, utilities, key=jax.random.fold_in(key, 1), **options)
     assert (one.updates, two.updates) == (1, 2)
@@ -302,9 +302,21 @@ def test_further_updates_go_on_from_the_last_with_the_spread_held_until_the_poli
     assert one.kl_fitted_policy < improvement.NEARLY * 0.5
     assert one.kl_fitted_policy < two.kl_fitted_policy
     assert two.kl_fitted_policy == pytest.approx(np.mean(two.policy.kl_divergence(first, states)))
-    assert three.updates == (2 if two.kl_fitted_policy >= improvement.NEARLY * 0.5 else 3)
+    assert two.kl_fitted_policy < improvement.NEARLY * 0.5 <= many.kl_fitted_policy
+    assert 2 < many.updates < 9
     improve(first, steps, utilities, updates=3, utility_draws=utilities[:, None], **(options | {"kl_bound": decide}))
     assert asked == [(500, 1)]  # the bound is that of the iteration
+
+
+def test_there_is_no_further_update_where_there_is_nothing_to_gain_and_none_at_all_is_refused():
+    steps, utilities = random_steps()
+    settled = improve(random_policy(), steps, utilities, updates=40, kl_bound=50.0)  # more than there is to gain
+    assert 1 < settled.updates < 40
+    assert not settled.reps.bound_active
+    assert improve(settled.policy, steps, utilities, updates=3, kl_bound=50.0).updates == 1
+    assert improve(random_policy(), steps, np.full(len(steps), 2.5), updates=3).updates == 1
+    with pytest.raises(ValueError, match=r"^updates: expected at least 1, got 0$"):
+        improve(random_policy(), steps, utilities, updates=0)
 
 
 def test_a_policy_that_follows_the_weights_takes_one_update_whatever_is_allowed():

@@ -123,6 +123,7 @@ def _facts(evidence: Evidence) -> list[tuple[str, str]]:
         ("steepness m", f"{evidence.fitted_with('steepness'):g}"),
         ("lapse rate λ", f"{evidence.fitted_with('lapse_rate'):g}"),
         ("KL bound ε", f"{settings.kl_bound:g}"),
+        ("updates an iteration, at most", str(settings.updates_per_iteration)),
         ("discount γ of Q", f"{settings.discount:g}"),
         ("discount γ of ψ", f"{settings.psi_discount:g}"),
         ("policy", settings.policy),

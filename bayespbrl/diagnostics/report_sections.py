@@ -120,6 +120,11 @@ def updates(evidence: Evidence, iterations: xr.Dataset) -> Section:
         "Where the KL reached is below the bound, the update had no more to gain. The fitted policy's KL should follow "
         "the one that REPS asked for. An entropy that falls to nothing early is a policy that has stopped exploring."
     )
+    if (iterations["updates"] > 1).any():
+        caption += (
+            " Where an iteration had several updates, the fitted policy's KL is that of all together, and the KL, the "
+            "temperature and the effective samples of REPS are those of the last."
+        )
     blocks: list[Any] = [drawn("updates", panels, caption, "KL, temperature, entropy and effective samples.")]
     text = []
     for group, label in (("schedule", "the schedule of the KL bound"), ("hyperparameters", "the hyper-parameters")):

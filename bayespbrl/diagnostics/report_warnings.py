@@ -68,7 +68,7 @@ def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Caution]:
     if (failed := iteration[table["reps_converged"].values == 0]).size:
         found.append(
             Caution(
-                f"REPS did not converge in {_which(failed)}: the policy stayed where it was.",
+                f"REPS did not converge in {_which(failed)}: that update left the policy where it was.",
                 "Fewer centres (--centres) or a smaller --kl-bound make the dual easier.",
             )
         )
@@ -81,7 +81,9 @@ def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Caution]:
                 "longer tells actions apart: ask more questions, or a policy with more entropy.",
             )
         )
-    fitted, reached = table["kl_fitted_policy"].values, table["kl"].values
+    # of several updates the policy's KL is that of all together, and REPS' own that of the last alone
+    several = table["updates"].values > 1
+    fitted, reached = table["kl_fitted_policy"].values, np.where(several, table["kl_bound"], table["kl"])
     if (bold := iteration[fitted > 3 * np.maximum(reached, 0.01)]).size:
         found.append(
             Caution(
@@ -93,8 +95,8 @@ def _of_updates(evidence: Evidence, table: xr.Dataset) -> list[Caution]:
         found.append(
             Caution(
                 f"The fitted policy went less than a third as far as REPS asked for in {_which(tame)}.",
-                "The policy smooths the update. Harmless while the value rises; more updates an iteration "
-                "(--updates-per-iteration 3) or a larger --kl-bound take it further.",
+                "The policy smooths the update. Harmless while the value rises; a larger --kl-bound takes it further"
+                + (", and so do more updates (--updates-per-iteration 3)." if not several.any() else "."),
             )
         )
     return found + _of_entropy(evidence, table)

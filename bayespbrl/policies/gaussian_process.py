@@ -212,7 +212,8 @@ class GaussianProcessPolicy:
 
     def fit_mean(self, *samples: np.ndarray, **options: Any) -> Self:
         """`fit` with the hyper-parameters held: noise and signal variance, bandwidths."""
-        return self.fit(*samples, hyperparameters="keep", **options)
+        kept = self.fit(*samples, hyperparameters="keep", **options)
+        return replace(kept, objective=self.objective, noise_at_bound=self.noise_at_bound)
 
     def _fit_output(
         self,

@@ -14,8 +14,8 @@ class Policy(Protocol):
     The methods that take a single observation are JAX-traceable, so that a rollout compiled once takes any policy of
     the same type as an argument (`batch` maps them over N observations); the others take and return NumPy arrays.
     Policies over discrete actions also have `probabilities(observations) -> (N, A)`, those over continuous actions
-    `action_standard_deviation(observations) -> (N, A)`; and they may have `fit_mean`, which is `fit` with the spread
-    held and takes its place in all but the first update of an iteration.
+    `action_standard_deviation(observations) -> (N, A)`; and they may have `fit_mean`, called as `fit` is, which holds
+    the spread and takes its place in all but the first update of an iteration.
     """
 
     @classmethod
