@@ -306,16 +306,18 @@ def rewrite(directory, changes, **more):
 
 def test_of_several_updates_the_policys_kl_is_held_against_the_bound_and_not_the_last_of_reps(copy):
     several = {"updates": 3, "kl_bound": 0.3, "kl": 0.005, "kl_fitted_policy": 0.12}
-    rewrite(copy, 3 * [several])
-    assert not [what for what in warned(read_evidence(copy)) if "fitted policy went" in what]
+
+    def cautions(**changes):
+        rewrite(copy, 3 * [several | changes])
+        return [w for w in assembled(read_evidence(copy))["warnings"] if "fitted policy went" in w.what]
+
+    assert not cautions()
     assert "Where an iteration had several updates" in write_report(copy).read_text(encoding="utf-8")
     for fitted, words in ((1.0, "more than three times as far"), (0.05, "less than a third as far")):
-        rewrite(copy, 3 * [several | {"kl_fitted_policy": fitted}])
-        (warning,) = [w for w in assembled(read_evidence(copy))["warnings"] if "fitted policy went" in w.what]
+        (warning,) = cautions(kl_fitted_policy=fitted)
         assert words in warning.what
         assert "--updates-per-iteration" not in warning.do
-    rewrite(copy, 3 * [several | {"updates": 1, "kl": 0.3, "kl_fitted_policy": 0.05}])
-    (warning,) = [w for w in assembled(read_evidence(copy))["warnings"] if "fitted policy went" in w.what]
+    (warning,) = cautions(updates=1, kl=0.3, kl_fitted_policy=0.05)
     assert "--updates-per-iteration 3" in warning.do
 
 
