@@ -312,10 +312,10 @@ def _print_trials(study: Any) -> None:
     optimum = _optimum(open_environment(table.attrs["env"]))
     names = ("lower_quartile", "median", "upper_quartile")
     rows = []
-    for iteration in quartiles["iteration"].values:
-        at = quartiles.sel(iteration=iteration)
+    for answers in quartiles["answers"].values:
+        at = quartiles.sel(answers=answers)
         shares = [] if optimum is None else [f"{float(at[name]) / optimum:.3f}" for name in names]
-        rows.append([f"{float(at['answers']):g}", *(f"{float(at[name]):.2f}" for name in names), *shares])
+        rows.append([f"{answers:g}", *(f"{float(at[name]):.2f}" for name in names), *shares])
     columns = ["answers", "25 %", "median", "75 %"] + ([] if optimum is None else ["25 %", "median", "75 %"])
     title = f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials: quartiles of the value"
     _table(title + ("" if optimum is None else ", and as a fraction of the optimum"), columns, rows)

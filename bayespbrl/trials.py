@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from bayespbrl import runs, trial_tables
@@ -41,11 +42,17 @@ class Trials:
     path: Path
 
     def quartiles(self) -> xr.Dataset:
-        """Median, lower and upper quartile of the value over seeds, by iteration, with the median of answers."""
-        value = self.table["value"]
+        """Median, lower and upper quartile of the value over seeds, by the number of answers.
+
+        A trial's value after so many answers is that of the last policy it had before it asked for more, or ended.
+        """
+        answers, value = self.table["answers"].values, self.table["value"].values
+        numbers = np.unique(answers[answers >= answers[:, 0].max()])
+        last = (answers[:, :, None] <= numbers).sum(axis=1) - 1
+        reached = np.take_along_axis(value, last, axis=1)
         levels = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
-        figures = {name: value.quantile(level, "seed").drop_vars("quantile") for name, level in levels.items()}
-        return xr.Dataset({"answers": self.table["answers"].median("seed"), **figures})
+        figures = {name: ("answers", np.quantile(reached, level, axis=0)) for name, level in levels.items()}
+        return xr.Dataset(figures, {"answers": numbers})
 
 
 def run_trials(

@@ -5,9 +5,11 @@
 The first study is the one that the others are compared with. For each: the median and lower quartile of the value at
 some numbers of answers and at the end; how many trials are lost, which is to end below `--lost`; the answers at which
 median and lower quartile of the relative value (specification, section 1: (value − floor) / (ceiling − floor)) first
-reach 0.95; and the median difference to the first study over the same seeds after as many answers as both have, with a
-95 % bootstrap interval. A study is a directory of `bayespbrl trials` or its table. The floor is the random policy's
-value; the ceiling a number, or a study with the known reward, whose median it is.
+reach 0.95, and the iterations at which they do; the median of the answers that a trial took; and the median difference
+to the first study over the same seeds, after as many answers as both have and at the end, with 95 % bootstrap
+intervals. Answers are those given before the next question: where an iteration asked nothing, what it learnt counts for
+the answers before. A study is a directory of `bayespbrl trials` or its table. The floor is the random policy's value;
+the ceiling a number, or a study with the known reward, whose median it is.
 """
 
 import argparse
@@ -21,7 +23,10 @@ REACHED = 0.95
 
 
 class Study:
-    """Values over (seed, iteration), and the answers at each iteration."""
+    """Values over (seed, iteration) and over (seed, answers).
+
+    After so many answers a trial has the last policy before it asked for more, or ended.
+    """
 
     def __init__(self, path: str):
         table = Path(path)
@@ -34,23 +39,35 @@ class Study:
                 seed[int(row["iteration"])] = int(row["answers"]), float(row["value"])
         self.seeds = sorted(rows)
         kept = [[rows[seed][iteration] for iteration in sorted(rows[seed])] for seed in self.seeds]
-        self.answers = np.array([answers for answers, _ in kept[0]])
-        self.values = np.array([[value for _, value in trial] for trial in kept])
+        answers = np.array([[answers for answers, _ in trial] for trial in kept])
+        self.by_iteration = np.array([[value for _, value in trial] for trial in kept])
+        self.used = float(np.median(answers[:, -1]))
+        self.answers = np.unique(answers[answers >= answers[:, 0].max()])
+        last = (answers[:, :, None] <= self.answers).sum(axis=1) - 1
+        self.values = np.take_along_axis(self.by_iteration, last, axis=1)
 
-    def at(self, answers: int) -> np.ndarray:
-        """The value of each trial once so many answers are in."""
+    def at(self, answers: float) -> np.ndarray:
+        """The value of each trial once so many answers are in; its last where it gave fewer."""
         return self.values[:, np.flatnonzero(self.answers <= answers)[-1]]
 
     def answers_to(self, value: float, quantile: float) -> str:
         """The first number of answers at which a quantile of the value is `value` or more."""
-        reached = np.flatnonzero(np.quantile(self.values, quantile, axis=0) >= value)
-        return str(self.answers[reached[0]]) if len(reached) else "never"
+        return first(self.answers, self.values, value, quantile)
+
+    def iterations_to(self, value: float, quantile: float) -> str:
+        """The first iteration at which it is."""
+        return first(1 + np.arange(self.by_iteration.shape[1]), self.by_iteration, value, quantile)
 
 
-def paired(study: Study, reference: Study) -> str:
-    """The median difference after as many answers as both have, over the seeds of both, with its bootstrap interval."""
+def first(numbers: np.ndarray, values: np.ndarray, value: float, quantile: float) -> str:
+    """The first of `numbers`, one a column of `values`, at which a quantile over the rows is `value` or more."""
+    reached = np.flatnonzero(np.quantile(values, quantile, axis=0) >= value)
+    return str(numbers[reached[0]]) if len(reached) else "never"
+
+
+def paired(study: Study, reference: Study, answers: float) -> str:
+    """The median difference after so many answers, over the seeds of both, with its bootstrap interval."""
     seeds = [seed for seed in study.seeds if seed in reference.seeds]
-    answers = min(study.answers[-1], reference.answers[-1])
     value, before = (one.at(answers)[[one.seeds.index(seed) for seed in seeds]] for one in (study, reference))
     differences = value - before
     chosen = np.random.default_rng(0).integers(len(seeds), size=(10_000, len(seeds)))
@@ -82,15 +99,22 @@ def main() -> None:
         print(f"relative value {REACHED}: {reached:.4g}")
     columns = [answers for answers in COLUMNS if answers < studies[0].answers[-1]]
     names = [f"after {answers}" for answers in columns]
-    names += ["at the end", "lost", "median at 0.95", "lower quartile at 0.95", "paired difference"]
+    names += ["at the end", "lost", "median at 0.95", "lower quartile at 0.95", "in iterations", "answers in all"]
+    names += ["paired difference", "at the end"]
     print("| study | trials | " + " | ".join(names) + " |")
     print("|---|" + "---|" * (len(names) + 1))
     for study in studies:
         cells = [study.at(answers) if answers <= study.answers[-1] else None for answers in columns]
         row = [summary(cell) for cell in [*cells, study.values[:, -1]]]
         row.append("–" if options.lost is None else str(int(np.sum(study.values[:, -1] < options.lost))))
-        row += ["–", "–"] if reached is None else [study.answers_to(reached, quantile) for quantile in (0.5, 0.25)]
-        row.append("–" if study is studies[0] else paired(study, studies[0]))
+        if reached is None:
+            row += ["–", "–", "–"]
+        else:
+            row += [study.answers_to(reached, quantile) for quantile in (0.5, 0.25)]
+            row.append("; ".join(study.iterations_to(reached, quantile) for quantile in (0.5, 0.25)))
+        row.append(f"{study.used:g}")
+        both = min(study.answers[-1], studies[0].answers[-1])
+        row += ["–", "–"] if study is studies[0] else [paired(study, studies[0], end) for end in (both, np.inf)]
         print(f"| {study.name} | {len(study.seeds)} | " + " | ".join(row) + " |")
 
 

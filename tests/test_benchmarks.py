@@ -68,17 +68,26 @@ def test_a_schedule_costs_what_updates_with_it_take_longer():
 def test_studies_are_compared_seed_by_seed(tmp_path):
     curves = {"first": {1: [0, 10, 20], 2: [0, 0, 4], 3: [0, 10, 12]}, "second": {3: [0, 20, 22], 1: [10, 20, 25]}}
     curves["longer"] = {seed: [*values, -999] for seed, values in curves["second"].items()}
+    curves["asks-less"] = curves["second"]  # after its first two answers it asks nothing more
     for name, trials in curves.items():
-        rows = [f"{seed},{i + 1},{i + 2},{value}" for seed, values in trials.items() for i, value in enumerate(values)]
+        asked = name != "asks-less"
+        rows = [
+            f"{seed},{i + 1},{2 + i * asked},{value}"
+            for seed, values in trials.items()
+            for i, value in enumerate(values)
+        ]
         (tmp_path / f"{name}.csv").write_text("\n".join(["seed,iteration,answers,value", *rows]))
     arguments = [str(tmp_path / f"{name}.csv") for name in curves]
     options = ["--floor", "0", "--ceiling", str(tmp_path / "second.csv"), "--lost", "10"]
     command = [sys.executable, str(BENCHMARKS / "compare.py"), *arguments, *options]
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines[0] == "relative value 0.95: 22.32"  # 0.95 of the median of 22 and 25
-    first, second, longer = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
-    assert first == ["first", "3", "12 [8]", "1", "never", "never", "–"]
+    first, second, longer, less = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
+    assert first == ["first", "3", "12 [8]", "1", "never", "never", "never; never", "4", "–", "–"]
     # seeds 3 and 1 differ by 10 and 5, in the second study's order as in any other
-    assert second == ["second", "2", "23.5 [22.75]", "0", "4", "4", "+7.5 [+5.0, +10.0]"]
+    assert second == ["second", "2", "23.5 [22.75]", "0", "4", "4", "3; 3", "4", *2 * ["+7.5 [+5.0, +10.0]"]]
     # a longer study is compared with the first at the answers that both have
-    assert longer == ["longer", "2", "-999 [-999]", "2", "4", "4", "+7.5 [+5.0, +10.0]"]
+    assert longer[:-1] == ["longer", "2", "-999 [-999]", "2", "4", "4", "3; 3", "5", "+7.5 [+5.0, +10.0]"]
+    assert longer[-1] == "-1015.0 [-1019.0, -1011.0]"
+    # what it learns without asking counts for the answers before: 22 and 25 after two, where the first study has 0
+    assert less == ["asks-less", "2", "23.5 [22.75]", "0", "2", "2", "3; 3", "2", "+23.5 [+22.0, +25.0]", second[-1]]

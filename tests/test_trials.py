@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -15,7 +16,7 @@ from bayespbrl import load, runs
 from bayespbrl import trials as trials_module
 from bayespbrl.rollouts import returns
 from bayespbrl.trial_tables import COLUMNS, collect
-from bayespbrl.trials import run_trials
+from bayespbrl.trials import Trials, run_trials
 
 QUICK = {"utility": "linear-program", "iterations": 2}
 
@@ -52,6 +53,18 @@ def test_quartiles_are_those_of_the_values(study):
     np.testing.assert_allclose(quartiles["median"], np.median(values, axis=0))
     np.testing.assert_allclose(quartiles["lower_quartile"], np.quantile(values, 0.25, axis=0))
     np.testing.assert_array_equal(quartiles["answers"], [2, 3])
+
+
+def test_quartiles_follow_the_answers_that_each_trial_gave():
+    # asks in the first and the third iteration; in every one; in the first alone
+    answers = np.array([[2, 2, 3, 3], [2, 3, 4, 5], [2, 2, 2, 2]])
+    values = np.array([[1.0, 2.0, 30.0, 40.0], [5.0, 6.0, 7.0, 8.0], [9.0, 11.0, 13.0, 15.0]])
+    table = xr.Dataset({"answers": (("seed", "iteration"), answers), "value": (("seed", "iteration"), values)})
+    quartiles = Trials(table, Path("study")).quartiles()
+    np.testing.assert_array_equal(quartiles["answers"], [2, 3, 4, 5])
+    columns = [[2, 5, 15], [40, 6, 15], [40, 7, 15], [40, 8, 15]]  # the last policy before the next question, or at all
+    np.testing.assert_allclose(quartiles["median"], np.median(columns, axis=1))
+    np.testing.assert_allclose(quartiles["upper_quartile"], np.quantile(columns, 0.75, axis=1))
 
 
 def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as_nan(tmp_path):

@@ -33,7 +33,7 @@ def quartile_curve(quartiles: xr.Dataset, axes: Axes, *, levels: Mapping[str, fl
     """Median of the value over trials against answers, with the band between the quartiles.
 
     Args:
-      quartiles: as `Trials.quartiles` gives them: answers, lower_quartile, median, upper_quartile by iteration.
+      quartiles: as `Trials.quartiles` gives them: lower_quartile, median and upper_quartile by answers.
       axes: to draw on.
       levels: horizontal lines by name, of what others have published or of the optimum.
     """
