@@ -43,6 +43,12 @@ KLBound = Annotated[float | None, typer.Option("--kl-bound", help="Bound on each
 UpdatesPerIteration = Annotated[
     int | None, typer.Option(help="Policy updates from the same trajectories and answers; the paper's is 1.")
 ]
+UnaskedIterations = Annotated[
+    int | None,
+    typer.Option(
+        help="Iterations in a row, at most, that ask nothing, as long as the schedule is sure; 0 is the paper's."
+    ),
+]
 Likelihood = Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or probit.")]
 PriorScale = Annotated[float | None, typer.Option(help="Prior standard deviation of a utility weight.")]
 Steepness = Annotated[float | None, typer.Option(help="Of the likelihood, in units of the largest difference.")]
@@ -70,6 +76,7 @@ def run(
     iterations: Iterations = None,
     kl_bound: KLBound = None,
     updates_per_iteration: UpdatesPerIteration = None,
+    unasked_iterations: UnaskedIterations = None,
     likelihood: Likelihood = None,
     prior_scale: PriorScale = None,
     steepness: Steepness = None,
@@ -124,6 +131,7 @@ def trials(
     iterations: Iterations = None,
     kl_bound: KLBound = None,
     updates_per_iteration: UpdatesPerIteration = None,
+    unasked_iterations: UnaskedIterations = None,
     likelihood: Likelihood = None,
     prior_scale: PriorScale = None,
     steepness: Steepness = None,

@@ -28,6 +28,8 @@ SCHEDULE_DRAWS = 100
 # quartile is at 0.95 of the relative value at answer 8 with 0.75 and where information is asked for always, at 11 with
 # 0.6. With the spread held, as it is now, and with one update only this one value was tried.
 SURE_SIGNAL = 0.75
+# From this signal on an iteration may ask nothing, as `unasked_iterations` says.
+UNASKED_SIGNAL = 0.6
 
 
 class Learner:
@@ -195,6 +197,8 @@ class Learner:
         if state.estimate is None:
             wanted = settings.first_queries
             candidates = queries.random_candidates(numbers, rng=self._rng(CHOOSE, state.iteration))
+        elif self._can_do_without():
+            wanted, candidates = 0, ()
         else:
             wanted = settings.queries_per_iteration
             candidates = self._candidates(numbers, collected)
@@ -206,6 +210,17 @@ class Learner:
             "seconds": time.perf_counter() - began,
         }
         self._record(event, trajectories=collected)
+
+    def _can_do_without(self) -> bool:
+        """Whether an iteration asks nothing: `unasked_iterations` allows it, and what is known is enough to go on.
+
+        Where the schedule has no signal there is nothing to go by, and the setting alone decides.
+        """
+        state, last = self.state, self.state.summaries[-1]
+        if state.unasked >= self.settings.unasked_iterations or not state.preferences.pairs:
+            return False
+        signal = last["schedule"].get("signal")
+        return signal is None or (last["utility_converged"] and signal >= UNASKED_SIGNAL)
 
     def _candidates(self, numbers: Sequence[int], collected: Sequence[Trajectory]) -> tuple[int, ...]:
         """As many trajectories as are new, in the order in which to ask about them."""

@@ -52,6 +52,7 @@ class LearnerState:
       collected: whether the next iteration's trajectories are among them.
       candidates: trajectories to ask about in this iteration, best first.
       wanted: answers still wanted in this iteration.
+      unasked: iterations in a row, up to now, that wanted none.
       query: the question that waits for an answer.
       queries: questions put so far.
       shown: the trajectories that some question showed.
@@ -67,6 +68,7 @@ class LearnerState:
     collected: bool = False
     candidates: tuple[int, ...] = ()
     wanted: int = 0
+    unasked: int = 0
     query: Query | None = None
     queries: int = 0
     shown: frozenset[int] = frozenset()
@@ -158,6 +160,7 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
         collected=True,
         candidates=candidates,
         wanted=event["wanted"],
+        unasked=0 if event["wanted"] else state.unasked + 1,
     )
 
 

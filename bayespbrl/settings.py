@@ -31,6 +31,7 @@ LEAST = {
     "seed": 0,
     "trajectories_per_iteration": 2,
     "updates_per_iteration": 1,
+    "unasked_iterations": 0,
     **dict.fromkeys(("iterations", "queries_per_iteration", "first_queries", "evaluation_episodes"), 1),
     **dict.fromkeys(("centres", "update_states", "exploration_hold", "max_steps", "recent_iterations"), 1),
 }
@@ -65,6 +66,10 @@ class Settings:
         0.75 or more; with less it asks for the most information about any trajectory that was never compared.
       trajectories_per_iteration: N.
       queries_per_iteration, first_queries: M, in later iterations and in the first.
+      unasked_iterations: so many iterations in a row, at most, ask nothing, once there is a preference: with the
+        schedule `confidence` while the posterior has converged and the signal is 0.6 or more; with one that has no
+        signal, as `constant`, always, so that there is a question every `unasked_iterations` + 1 iterations. 0 is the
+        paper's.
       discount: γ.
       trajectory_discount: γ of ψ(τ) in the preferences; None for `discount`, as in the paper; 1 for an expert who
         judges whole trajectories, whose answers less would explain by how the trajectories begin.
@@ -107,6 +112,7 @@ class Settings:
     trajectories_per_iteration: int = 10
     queries_per_iteration: int = 1
     first_queries: int = 2
+    unasked_iterations: int = 0
     discount: float = 0.98
     trajectory_discount: float | None = None
     policy: str = "auto"

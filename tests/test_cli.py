@@ -73,11 +73,11 @@ def test_trials_tell_redraws_and_how_long_the_final_policies_last(capsys):
 def test_options_reach_the_settings(monkeypatch, tmp_path):
     out = tmp_path / "run"
     options = ["--kl-bound", "0.2", "--seed", "7", "--steepness", "3", "--wrong-answers", "0.1"]
-    options += ["--updates-per-iteration", "2"]
+    options += ["--updates-per-iteration", "2", "--unasked-iterations", "1"]
     assert call(monkeypatch, "run", "gridworld", *QUICK, *options, "--out", out) == 0
     settings = json.loads((out / "settings.json").read_text())
     expected = {"kl_bound": 0.2, "seed": 7, "steepness": 3.0, "wrong_answers": 0.1, "utility": "linear-program"}
-    expected["updates_per_iteration"] = 2
+    expected |= {"updates_per_iteration": 2, "unasked_iterations": 1}
     assert {name: settings[name] for name in expected} == expected
 
 

@@ -1,12 +1,14 @@
 """The learner: its protocol, ask and tell, undo and skip, and continuing from any point."""
 
+import itertools
+
 import gymnasium
 import jax
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from bayespbrl import Answer, Learner, ReturnExpert, improvement, queries, rollouts
+from bayespbrl import Answer, Learner, ReturnExpert, cycle, improvement, queries, rollouts
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
@@ -138,6 +140,51 @@ def test_a_learner_that_looks_at_draws_continues_as_if_never_stopped(options):
 def test_more_questions_an_iteration_are_asked_one_after_the_other():
     run = learner(first_queries=4, queries_per_iteration=3).run(ReturnExpert())
     assert [summary["answers"] for summary in run.iterations] == [4, 7, 10]
+
+
+def test_without_a_signal_every_so_many_iterations_ask_nothing():
+    run, log = remembered(iterations=8, unasked_iterations=2)
+    run.run(ReturnExpert())
+    assert [summary["answers"] for summary in run.iterations] == [2, 2, 2, 3, 3, 3, 4, 4]
+    assert len(run.trajectories) == 80
+    for length in range(4, len(log.entries), 3):
+        continued = learner(log.entries[:length], iterations=8, unasked_iterations=2)
+        assert fingerprint(continued.run(ReturnExpert())) == fingerprint(run)
+
+
+def test_as_long_as_there_is_no_preference_every_iteration_asks():
+    run = learner(iterations=4, unasked_iterations=3)
+    while questions := run.ask():
+        run.tell(["tie" if run.state.iteration < 2 else ReturnExpert()(*questions[0].trajectories)])
+    assert [summary["answers"] for summary in run.iterations] == [2, 3, 4, 4]
+
+
+def test_undoing_goes_back_over_iterations_that_asked_nothing():
+    run = learner(iterations=6, unasked_iterations=2)
+    first = run.ask()
+    run.tell(["tie"])
+    second = run.ask()
+    run.tell([ReturnExpert()(*second[0].trajectories)])
+    assert run.state.iteration == 3
+    run.undo()
+    assert (run.state.iteration, run.ask()[0].number) == (0, second[0].number)
+    run.undo()
+    assert run.ask()[0].number == first[0].number
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threshold", [0.0, 0.6, 1.1])
+def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
+    monkeypatch.setattr(cycle, "UNASKED_SIGNAL", threshold)
+    options = {"utility": "posterior-mean", "schedule": "confidence", "unasked_iterations": 2, "iterations": 12}
+    run = learner(**options).run(ReturnExpert())
+    unasked = 0
+    for last, summary in itertools.pairwise(run.iterations):
+        sure = last["utility_converged"] and last["schedule"]["signal"] >= threshold and unasked < 2
+        unasked = unasked + 1 if sure else 0
+        assert summary["answers"] == last["answers"] + (not sure)
+    answers = run.iterations[-1]["answers"]
+    assert answers == {0.0: 5, 1.1: 13}.get(threshold, answers)
 
 
 def test_asking_again_changes_nothing():

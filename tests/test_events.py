@@ -68,6 +68,13 @@ def test_the_first_candidate_of_a_run_is_what_the_others_are_compared_with():
     assert (state.candidates, state.wanted, state.collected) == ((2, 1), 2, True)
 
 
+def test_iterations_in_a_row_without_a_question_are_counted():
+    quiet = (collected(3, [], wanted=0), improved(3), collected(4, [], wanted=0), improved(4))
+    assert [replay(START, (*HISTORY, *quiet[:n])).unasked for n in range(5)] == [0, 1, 1, 2, 2]
+    assert replay(START, (*HISTORY, *quiet, collected(5, [5], seed=2))).unasked == 0
+    assert replay(START, (*HISTORY, *quiet, UNDONE)).query.number == 3
+
+
 def test_a_question_holds_the_two_trajectories_in_the_order_shown():
     state = replay(START, HISTORY[:4])
     assert state.query.trajectories == (state.trajectories[2], state.trajectories[1])

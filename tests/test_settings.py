@@ -38,6 +38,7 @@ BAD = {
     "max_steps": [0, -1, True, 10.0],
     "recent_iterations": [0, -4, True, 2.0],
     "updates_per_iteration": [0, -1, True, 1.5, None],
+    "unasked_iterations": [-1, True, 1.5, None],
     "exploration_hold": [0, -1, True, 2.0, None],
     "schedule": ["bold", None],
     "hyperparameters": ["chosen", None],

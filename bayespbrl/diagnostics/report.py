@@ -124,6 +124,7 @@ def _facts(evidence: Evidence) -> list[tuple[str, str]]:
         ("lapse rate λ", f"{evidence.fitted_with('lapse_rate'):g}"),
         ("KL bound ε", f"{settings.kl_bound:g}"),
         ("updates an iteration, at most", str(settings.updates_per_iteration)),
+        ("iterations in a row without a question, at most", str(settings.unasked_iterations)),
         ("discount γ of Q", f"{settings.discount:g}"),
         ("discount γ of ψ", f"{settings.psi_discount:g}"),
         ("policy", settings.policy),
