@@ -29,7 +29,7 @@ SCHEDULE_DRAWS = 100
 # 0.6. With the spread held, as it is now, and with one update only this one value was tried.
 SURE_SIGNAL = 0.75
 # From this signal on an iteration may ask nothing, as `unasked_iterations` says.
-UNASKED_SIGNAL = 0.6
+UNASKED_SIGNAL = 0.5
 
 
 class Learner:

@@ -67,7 +67,7 @@ class Settings:
       trajectories_per_iteration: N.
       queries_per_iteration, first_queries: M, in later iterations and in the first.
       unasked_iterations: so many iterations in a row, at most, ask nothing, once there is a preference: with the
-        schedule `confidence` while the posterior has converged and the signal is 0.6 or more; with one that has no
+        schedule `confidence` while the posterior has converged and the signal is 0.5 or more; with one that has no
         signal, as `constant`, always, so that there is a question every `unasked_iterations` + 1 iterations. 0 is the
         paper's.
       discount: γ.

@@ -173,7 +173,7 @@ def test_undoing_goes_back_over_iterations_that_asked_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("threshold", [0.0, 0.6, 1.1])
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.1])
 def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
     monkeypatch.setattr(cycle, "UNASKED_SIGNAL", threshold)
     options = {"utility": "posterior-mean", "schedule": "confidence", "unasked_iterations": 2, "iterations": 12}
