@@ -321,6 +321,17 @@ def test_of_several_updates_the_policys_kl_is_held_against_the_bound_and_not_the
     assert "--updates-per-iteration 3" in warning.do
 
 
+def test_iterations_that_asked_nothing_are_told(finished, tmp_path):
+    run = start(tmp_path / "run", utility="linear-program", unasked_iterations=1, iterations=4).run(ReturnExpert())
+    text = read(bayespbrl.load(tmp_path / "run").report()).text
+    assert run.preferences.answers == 3
+    assert "After 3 answers and 4 iterations, 2 of which asked nothing, the policy's value" in text
+    assert ("iterations in a row without a question, at most", "1") in assembled(read_evidence(tmp_path / "run"))[
+        "facts"
+    ]
+    assert "asked nothing" not in read(bayespbrl.load(finished).report()).text
+
+
 def test_an_answer_that_the_estimate_contradicts_is_named(tmp_path):
     trick = iter(["first", "first", "second", "first"])
     directory = tmp_path / "run"

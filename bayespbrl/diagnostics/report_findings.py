@@ -41,6 +41,8 @@ def learnt(
 def _reached(evidence: Evidence, iterations: xr.Dataset) -> str:
     value, answers = iterations["value"].values, iterations["answers"].values
     so_far = f"{count(int(np.nan_to_num(answers[-1])), 'answer')} and {count(len(value), 'iteration')}"
+    if unasked := int(np.sum(np.diff(answers) == 0)):
+        so_far += f", {unasked} of which asked nothing,"
     if np.isnan(value).any():
         return f"After {so_far} the value of the policy is not known for every iteration."
     episodes = count(evidence.settings.evaluation_episodes, "fresh episode")
