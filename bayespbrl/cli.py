@@ -46,7 +46,8 @@ UpdatesPerIteration = Annotated[
 UnaskedIterations = Annotated[
     int | None,
     typer.Option(
-        help="Iterations in a row, at most, that ask nothing, as long as the schedule is sure; 0 is the paper's."
+        help="Iterations in a row, at most, that ask nothing: with the schedule confidence while it is sure, with "
+        "constant always; 0 is the paper's."
     ),
 ]
 Likelihood = Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or probit.")]

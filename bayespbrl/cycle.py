@@ -155,7 +155,7 @@ class Learner:
 
         Args:
           expert: called with the two trajectories in the order shown.
-          progress: called after each answer.
+          progress: called after each answer, once all that follows without another is done.
         """
         while questions := self.ask():
             answers = [parse_answer(expert(*query.trajectories)) for query in questions]
@@ -214,13 +214,15 @@ class Learner:
     def _can_do_without(self) -> bool:
         """Whether an iteration asks nothing: `unasked_iterations` allows it, and what is known is enough to go on.
 
-        Where the schedule has no signal there is nothing to go by, and the setting alone decides.
+        Where the schedule records no signal there is nothing to go by, and the setting alone decides.
         """
         state, last = self.state, self.state.summaries[-1]
         if state.unasked >= self.settings.unasked_iterations or not state.preferences.pairs:
             return False
-        signal = last["schedule"].get("signal")
-        return signal is None or (last["utility_converged"] and signal >= UNASKED_SIGNAL)
+        if "signal" not in last["schedule"]:
+            return True
+        signal = last["schedule"]["signal"]  # of a schedule of the user's own it may be anything
+        return isinstance(signal, int | float) and bool(last["utility_converged"]) and signal >= UNASKED_SIGNAL
 
     def _candidates(self, numbers: Sequence[int], collected: Sequence[Trajectory]) -> tuple[int, ...]:
         """As many trajectories as are new, in the order in which to ask about them."""

@@ -45,7 +45,8 @@ class Bound:
     Attributes:
       kl_bound: ε of eq. 11, nats.
       reason: in words.
-      statistics: what it rests on, by name: plain numbers.
+      statistics: what it rests on, by name: plain numbers. One named `signal`, in [0, 1], also says whether an
+        iteration may ask nothing (`Settings.unasked_iterations`).
     """
 
     kl_bound: float

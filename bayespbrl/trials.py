@@ -51,8 +51,10 @@ class Trials:
         last = (answers[:, :, None] <= numbers).sum(axis=1) - 1
         reached = np.take_along_axis(value, last, axis=1)
         levels = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
-        figures = {name: ("answers", np.quantile(reached, level, axis=0)) for name, level in levels.items()}
-        return xr.Dataset(figures, {"answers": numbers})
+        curves = xr.DataArray(reached, {"answers": numbers}, ("seed", "answers"))
+        return xr.Dataset(
+            {name: curves.quantile(level, "seed").drop_vars("quantile") for name, level in levels.items()}
+        )
 
 
 def run_trials(

@@ -6,10 +6,10 @@ The first study is the one that the others are compared with. For each: the medi
 some numbers of answers and at the end; how many trials are lost, which is to end below `--lost`; the answers at which
 median and lower quartile of the relative value (specification, section 1: (value − floor) / (ceiling − floor)) first
 reach 0.95, and the iterations at which they do; the median of the answers that a trial took; and the median difference
-to the first study over the same seeds, after as many answers as both have and at the end, with 95 % bootstrap
-intervals. Answers are those given before the next question: where an iteration asked nothing, what it learnt counts for
-the answers before. A study is a directory of `bayespbrl trials` or its table. The floor is the random policy's value;
-the ceiling a number, or a study with the known reward, whose median it is.
+to the first study over the same seeds, after as many answers as every trial of both gave and at the end, with 95 %
+bootstrap intervals. Answers are those given before the next question: where an iteration asked nothing, what it learnt
+counts for the answers before. A study is a directory of `bayespbrl trials` or its table. The floor is the random
+policy's value; the ceiling a number, or a study with the known reward, whose median it is.
 """
 
 import argparse
@@ -41,7 +41,7 @@ class Study:
         kept = [[rows[seed][iteration] for iteration in sorted(rows[seed])] for seed in self.seeds]
         answers = np.array([[answers for answers, _ in trial] for trial in kept])
         self.by_iteration = np.array([[value for _, value in trial] for trial in kept])
-        self.used = float(np.median(answers[:, -1]))
+        self.used = answers[:, -1]
         self.answers = np.unique(answers[answers >= answers[:, 0].max()])
         last = (answers[:, :, None] <= self.answers).sum(axis=1) - 1
         self.values = np.take_along_axis(self.by_iteration, last, axis=1)
@@ -97,14 +97,15 @@ def main() -> None:
             ceiling = float(np.median(Study(options.ceiling).values[:, -1]))
         reached = options.floor + REACHED * (ceiling - options.floor)
         print(f"relative value {REACHED}: {reached:.4g}")
-    columns = [answers for answers in COLUMNS if answers < studies[0].answers[-1]]
+    most = max(np.median(study.used) for study in studies)
+    columns = [answers for answers in COLUMNS if answers < most]
     names = [f"after {answers}" for answers in columns]
     names += ["at the end", "lost", "median at 0.95", "lower quartile at 0.95", "in iterations", "answers in all"]
-    names += ["paired difference", "at the end"]
+    names += ["paired difference", "paired at the end"]
     print("| study | trials | " + " | ".join(names) + " |")
     print("|---|" + "---|" * (len(names) + 1))
     for study in studies:
-        cells = [study.at(answers) if answers <= study.answers[-1] else None for answers in columns]
+        cells = [study.at(answers) if answers <= np.median(study.used) else None for answers in columns]
         row = [summary(cell) for cell in [*cells, study.values[:, -1]]]
         row.append("–" if options.lost is None else str(int(np.sum(study.values[:, -1] < options.lost))))
         if reached is None:
@@ -112,8 +113,8 @@ def main() -> None:
         else:
             row += [study.answers_to(reached, quantile) for quantile in (0.5, 0.25)]
             row.append("; ".join(study.iterations_to(reached, quantile) for quantile in (0.5, 0.25)))
-        row.append(f"{study.used:g}")
-        both = min(study.answers[-1], studies[0].answers[-1])
+        row.append(f"{np.median(study.used):g}")
+        both = min(*study.used, *studies[0].used)
         row += ["–", "–"] if study is studies[0] else [paired(study, studies[0], end) for end in (both, np.inf)]
         print(f"| {study.name} | {len(study.seeds)} | " + " | ".join(row) + " |")
 

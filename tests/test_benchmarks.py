@@ -77,12 +77,16 @@ def test_studies_are_compared_seed_by_seed(tmp_path):
             for i, value in enumerate(values)
         ]
         (tmp_path / f"{name}.csv").write_text("\n".join(["seed,iteration,answers,value", *rows]))
+    # one of three asks nothing more; they are compared after the two answers that all have
+    uneven = ["1,1,2,5", "1,2,2,30", "2,1,2,5", "2,2,3,40", "3,1,2,5", "3,2,3,50"]
+    (tmp_path / "uneven.csv").write_text("\n".join(["seed,iteration,answers,value", *uneven]))
+    curves["uneven"] = {}
     arguments = [str(tmp_path / f"{name}.csv") for name in curves]
     options = ["--floor", "0", "--ceiling", str(tmp_path / "second.csv"), "--lost", "10"]
     command = [sys.executable, str(BENCHMARKS / "compare.py"), *arguments, *options]
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines[0] == "relative value 0.95: 22.32"  # 0.95 of the median of 22 and 25
-    first, second, longer, less = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
+    first, second, longer, less, uneven = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
     assert first == ["first", "3", "12 [8]", "1", "never", "never", "never; never", "4", "–", "–"]
     # seeds 3 and 1 differ by 10 and 5, in the second study's order as in any other
     assert second == ["second", "2", "23.5 [22.75]", "0", "4", "4", "3; 3", "4", *2 * ["+7.5 [+5.0, +10.0]"]]
@@ -91,3 +95,6 @@ def test_studies_are_compared_seed_by_seed(tmp_path):
     assert longer[-1] == "-1015.0 [-1019.0, -1011.0]"
     # what it learns without asking counts for the answers before: 22 and 25 after two, where the first study has 0
     assert less == ["asks-less", "2", "23.5 [22.75]", "0", "2", "2", "3; 3", "2", "+23.5 [+22.0, +25.0]", second[-1]]
+    # after two answers 30, 5 and 5, where the first study has 0 each; at the end 30, 40, 50, where it has 20, 4, 12
+    assert uneven[0] == "uneven"
+    assert uneven[-3:] == ["3", "+5.0 [+5.0, +30.0]", "+36.0 [+10.0, +38.0]"]

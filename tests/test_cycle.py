@@ -1,5 +1,6 @@
 """The learner: its protocol, ask and tell, undo and skip, and continuing from any point."""
 
+import dataclasses
 import itertools
 
 import gymnasium
@@ -170,6 +171,30 @@ def test_undoing_goes_back_over_iterations_that_asked_nothing():
     assert (run.state.iteration, run.ask()[0].number) == (0, second[0].number)
     run.undo()
     assert run.ask()[0].number == first[0].number
+
+
+@pytest.mark.parametrize(
+    ("said", "converged", "asks"),
+    [
+        ({"signal": 0.5}, True, False),
+        ({"signal": 0.49}, True, True),
+        ({"signal": 0.9}, False, True),
+        ({"signal": None}, True, True),
+        ({"signal": "high"}, True, True),
+        ({}, False, False),
+    ],
+)
+def test_what_the_schedule_said_decides_whether_to_ask(said, converged, asks):
+    run = learner(iterations=2, unasked_iterations=1)
+    while run.state.iteration < 1:
+        questions = run.ask()
+        last = run.state
+        run.tell([ReturnExpert()(*questions[0].trajectories)])
+    improved = run.state.summaries[0] | {"schedule": said, "utility_converged": converged}
+    again = learner(iterations=2, unasked_iterations=1)
+    again.state = dataclasses.replace(run.state, summaries=(improved,), collected=False, iteration=1, unasked=0)
+    assert last.preferences.answers == 1
+    assert bool(again.ask()) == asks
 
 
 @pytest.mark.slow

@@ -330,6 +330,11 @@ def test_iterations_that_asked_nothing_are_told(finished, tmp_path):
         "facts"
     ]
     assert "asked nothing" not in read(bayespbrl.load(finished).report()).text
+    skipped = start(tmp_path / "skipped", utility="linear-program")
+    while questions := skipped.ask():
+        skipped.tell(["skip" if skipped.state.iteration == 1 else ReturnExpert()(*questions[0].trajectories)])
+    assert [summary["answers"] for summary in skipped.iterations] == [2, 2, 3]
+    assert "asked nothing, the" not in read(bayespbrl.load(tmp_path / "skipped").report()).text
 
 
 def test_an_answer_that_the_estimate_contradicts_is_named(tmp_path):

@@ -41,7 +41,9 @@ def learnt(
 def _reached(evidence: Evidence, iterations: xr.Dataset) -> str:
     value, answers = iterations["value"].values, iterations["answers"].values
     so_far = f"{count(int(np.nan_to_num(answers[-1])), 'answer')} and {count(len(value), 'iteration')}"
-    if unasked := int(np.sum(np.diff(answers) == 0)):
+    asked = {record.iteration for record in evidence.answers}  # a question that was skipped is one
+    quiet = iterations["iteration"].values[1:][np.diff(answers) == 0]
+    if unasked := len(set(quiet.tolist()) - asked):
         so_far += f", {unasked} of which asked nothing,"
     if np.isnan(value).any():
         return f"After {so_far} the value of the policy is not known for every iteration."
@@ -51,7 +53,7 @@ def _reached(evidence: Evidence, iterations: xr.Dataset) -> str:
     if optimum is not None:
         text += f", {percent(value[-1] / optimum, 1)} of the optimum {figure(optimum)}"
     best = int(np.argmax(value))
-    when = f"after {count(int(answers[best]), 'answer')}"
+    when = f"after {count(int(answers[best]), 'answer')}" + (f" and {count(best + 1, 'iteration')}" if unasked else "")
     text += f". After the first iteration it was {figure(value[0])}; "
     if best == len(value) - 1:
         return f"{text}it has never been better."

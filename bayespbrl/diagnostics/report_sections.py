@@ -24,10 +24,12 @@ def learning(evidence: Evidence, iterations: xr.Dataset) -> Section:
     if not iterations.sizes["iteration"]:
         return Section("learning", "Learning curve", ["No iteration is completed yet."])
     optimum = getattr(evidence.dynamics, "optimal_return", None)
+    quiet = bool(np.any(np.diff(iterations["answers"]) == 0))
     panels = [("Value against answers", partial(figures.plot_value, iterations, optimum=optimum))]
     caption = (
         "Each point is the policy after an update, valued by fresh episodes whose reward the learner never sees. "
         "Look for a rise that levels off, and for falls after it."
+        + (" Points above one another are of iterations that asked nothing." if quiet else "")
     )
     first, last = float(iterations["value"][0]), float(iterations["value"][-1])
     alt = f"Learning curve: value from {figure(first)} to {figure(last)} over {int(iterations['answers'][-1])} answers."
