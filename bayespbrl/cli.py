@@ -295,8 +295,10 @@ def _optimum(environment: Any) -> float | None:
 def _print_iterations(learner: Any) -> None:
     """A row for the first iteration, every fifth and the last, narrow enough for eighty columns."""
     optimum = _optimum(learner.environment)
+    quiet = len({s["answers"] for s in learner.iterations}) < len(learner.iterations)  # answers do not tell them apart
     rows = [
         [
+            *([str(s["iteration"])] if quiet else []),
             str(s["answers"]),
             f"{s['value']:.2f}",
             *([] if optimum is None else [f"{s['value'] / optimum:.1%}"]),
@@ -309,7 +311,7 @@ def _print_iterations(learner: Any) -> None:
         if s["iteration"] % 5 == 0 or s["iteration"] in (1, len(learner.iterations))
     ]
     share = [] if optimum is None else ["optimum"]
-    columns = ["answers", "value", *share, "pairs", "KL/bound", "R̂", "draws"]
+    columns = ["iteration"] * quiet + ["answers", "value", *share, "pairs", "KL/bound", "R̂", "draws"]
     _table(f"{learner.settings.env}, {learner.settings.utility}, seed {learner.settings.seed}", columns, rows)
 
 

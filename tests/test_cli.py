@@ -81,6 +81,17 @@ def test_options_reach_the_settings(monkeypatch, tmp_path):
     assert {name: settings[name] for name in expected} == expected
 
 
+def test_rows_that_answers_do_not_tell_apart_have_their_iteration(monkeypatch, capsys, tmp_path):
+    options = ["--utility", "linear-program", "--iterations", "6", "--unasked-iterations", "5"]
+    assert call(monkeypatch, "run", "gridworld", *options, "--out", tmp_path / "quiet") == 0
+    shown = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("│")[1:3]] for line in shown.splitlines() if line.startswith("│")]
+    assert rows == [["1", "2"], ["5", "2"], ["6", "2"]]
+    assert max(len(line) for line in shown.splitlines() if line.startswith(("│", "┃"))) <= 80
+    call(monkeypatch, "run", "gridworld", *QUICK, "--out", tmp_path / "asks")
+    assert "iteration ┃" not in capsys.readouterr().out
+
+
 def test_resuming_a_finished_run_says_so(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     call(monkeypatch, "run", "gridworld", *QUICK, "--out", out)
