@@ -303,7 +303,7 @@ def _print_iterations(learner: Any) -> None:
             f"{s['value']:.2f}",
             *([] if optimum is None else [f"{s['value'] / optimum:.1%}"]),
             f"{s['pairs_satisfied']}/{s['pairs']}",
-            f"{s['kl']:.3f}/{s['kl_bound']:g}",
+            f"{s['kl']:.3f}/{s['kl_bound']:.2g}",
             _number(s["rhat_max"], ".3f"),
             _number(s["effective_sample_size_min"], ".0f"),
         ]
