@@ -53,6 +53,22 @@ def collect(directories: Sequence[Path | str]) -> xr.Dataset:
     return xr.Dataset(variables, {"seed": seeds, "iteration": iterations}, attributes)
 
 
+def by_answers(answers: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values over (seed, iteration) as values over (seed, answers), for trials that need not ask in step.
+
+    Args:
+      answers: given by each iteration, shape (S, I), never decreasing along it.
+      values: shape (S, I).
+
+    Returns:
+      the n numbers of answers from the first that every trial has given on, shape (n,), and for each the value of a
+      trial's last policy before it asked for more, or ended, shape (S, n).
+    """
+    numbers = np.unique(answers[answers >= answers[:, 0].max()])
+    last = (answers[:, :, None] <= numbers).sum(axis=1) - 1
+    return numbers, np.take_along_axis(values, last, axis=1)
+
+
 def _flat(entry: dict[str, Any]) -> dict[str, Any]:
     inner = {
         f"{name}_{key}": part for name, value in entry.items() if isinstance(value, dict) for key, part in value.items()

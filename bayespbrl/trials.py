@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from bayespbrl import runs, trial_tables
@@ -46,10 +45,7 @@ class Trials:
 
         A trial's value after so many answers is that of the last policy it had before it asked for more, or ended.
         """
-        answers, value = self.table["answers"].values, self.table["value"].values
-        numbers = np.unique(answers[answers >= answers[:, 0].max()])
-        last = (answers[:, :, None] <= numbers).sum(axis=1) - 1
-        reached = np.take_along_axis(value, last, axis=1)
+        numbers, reached = trial_tables.by_answers(self.table["answers"].values, self.table["value"].values)
         levels = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
         curves = xr.DataArray(reached, {"answers": numbers}, ("seed", "answers"))
         return xr.Dataset(

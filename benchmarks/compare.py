@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bayespbrl.trial_tables import by_answers
+
 COLUMNS = (6, 8, 10, 15, 20, 30)
 REACHED = 0.95
 
@@ -42,9 +44,7 @@ class Study:
         answers = np.array([[answers for answers, _ in trial] for trial in kept])
         self.by_iteration = np.array([[value for _, value in trial] for trial in kept])
         self.used = answers[:, -1]
-        self.answers = np.unique(answers[answers >= answers[:, 0].max()])
-        last = (answers[:, :, None] <= self.answers).sum(axis=1) - 1
-        self.values = np.take_along_axis(self.by_iteration, last, axis=1)
+        self.answers, self.values = by_answers(answers, self.by_iteration)
 
     def at(self, answers: float) -> np.ndarray:
         """The value of each trial once so many answers are in; its last where it gave fewer."""
