@@ -28,7 +28,7 @@ SCHEDULE_DRAWS = 100
 # quartile is at 0.95 of the relative value at answer 8 with 0.75 and where information is asked for always, at 11 with
 # 0.6. With the spread held, as it is now, and with one update only this one value was tried.
 SURE_SIGNAL = 0.75
-# From this signal on an iteration may ask nothing, as `unasked_iterations` says.
+# From this signal on an iteration may ask nothing, as `unasked_iterations` says; chosen in RESULTS.md, "Asking less".
 UNASKED_SIGNAL = 0.5
 
 

@@ -38,12 +38,16 @@ def learnt(
     return sentences
 
 
+def iterations_that_asked_nothing(evidence: Evidence, iterations: xr.Dataset) -> int:
+    """How many iterations put no question; one that was skipped was put."""
+    without_answer = iterations["iteration"].values[1:][np.diff(iterations["answers"].values) == 0]
+    return len(set(without_answer.tolist()) - {record.iteration for record in evidence.answers})
+
+
 def _reached(evidence: Evidence, iterations: xr.Dataset) -> str:
     value, answers = iterations["value"].values, iterations["answers"].values
     so_far = f"{count(int(np.nan_to_num(answers[-1])), 'answer')} and {count(len(value), 'iteration')}"
-    asked = {record.iteration for record in evidence.answers}  # a question that was skipped is one
-    quiet = iterations["iteration"].values[1:][np.diff(answers) == 0]
-    if unasked := len(set(quiet.tolist()) - asked):
+    if unasked := iterations_that_asked_nothing(evidence, iterations):
         so_far += f", {unasked} of which asked nothing,"
     if np.isnan(value).any():
         return f"After {so_far} the value of the policy is not known for every iteration."

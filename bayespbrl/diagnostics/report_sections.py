@@ -12,7 +12,7 @@ from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.prequential import plot_calibration
 from bayespbrl.diagnostics.report_document import Section, Table, drawn
 from bayespbrl.diagnostics.report_evidence import Evidence
-from bayespbrl.diagnostics.report_findings import cell, figure, no_posterior
+from bayespbrl.diagnostics.report_findings import cell, figure, iterations_that_asked_nothing, no_posterior
 from bayespbrl.diagnostics.uncertainty import thinned
 from bayespbrl.settings import WITHOUT_POSTERIOR
 
@@ -24,7 +24,7 @@ def learning(evidence: Evidence, iterations: xr.Dataset) -> Section:
     if not iterations.sizes["iteration"]:
         return Section("learning", "Learning curve", ["No iteration is completed yet."])
     optimum = getattr(evidence.dynamics, "optimal_return", None)
-    quiet = bool(np.any(np.diff(iterations["answers"]) == 0))
+    quiet = iterations_that_asked_nothing(evidence, iterations)
     panels = [("Value against answers", partial(figures.plot_value, iterations, optimum=optimum))]
     caption = (
         "Each point is the policy after an update, valued by fresh episodes whose reward the learner never sees. "
