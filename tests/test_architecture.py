@@ -36,7 +36,7 @@ GROUPS = {
     "report": ["diagnostics.report"],
     "trials": ["trials", "trial_tables"],
     "film": ["film"],
-    "command line": ["cli", "__main__"],
+    "command line": ["cli", "screen", "__main__"],
 }
 GROUND = ["numerics", "convergence", "environments"]
 FLOWS = [*GROUND, "models", "policies", "what flows round"]

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayespbrl.cli import _print_trials, main
+from bayespbrl.cli import main
+from bayespbrl.screen import print_trials
 from bayespbrl.trials import Trials
 
 QUICK = ["--utility", "linear-program", "--iterations", "2"]
@@ -63,7 +64,7 @@ def test_trials_tell_redraws_and_how_long_the_final_policies_last(capsys):
     )
     table["terminated"] = ("seed", "iteration"), np.array([[0.0], [0.25]])
     table["balancing_steps"] = "seed", np.array([100.0, 300.0]), {"max_steps": 3000, "episodes": 100}
-    _print_trials(Trials(table, Path("study")))
+    print_trials(Trials(table, Path("study")))
     shown = capsys.readouterr().out
     assert "Redrawn for want of a preference: 2 trials, seeds 2, 4." in shown
     assert "87.5% of the evaluation episodes survive (worst trial 75.0%)" in shown
