@@ -132,6 +132,10 @@ class Learner:
         Raises:
           ValueError: an answer that is none, or not as many answers as questions; nothing has happened then.
         """
+        self._take_in(answers)
+        self._advance()
+
+    def _take_in(self, answers: Sequence[Answer | str]) -> None:
         waiting = self._waiting()
         if isinstance(answers, str) or not isinstance(answers, Sequence) or len(answers) != len(waiting):
             raise ValueError(f"tell: expected a list of {len(waiting)} answers, one a question, got {answers!r}")
@@ -140,7 +144,6 @@ class Learner:
                 self.undo()
             else:
                 self._record({"event": "answered", "query": query.number, "answer": str(answer)})
-        self._advance()
 
     def undo(self) -> None:
         """Take the last answer back, and what followed from it; its question waits again.
@@ -155,15 +158,15 @@ class Learner:
 
         Args:
           expert: called with the two trajectories in the order shown.
-          progress: called after each answer, once all that follows without another is done.
+          progress: called after each iteration, those that ask nothing among them.
         """
-        while questions := self.ask():
+        self._advance(progress)
+        while questions := self._waiting():
             answers = [parse_answer(expert(*query.trajectories)) for query in questions]
             if answers == [Answer.UNDO] and self.state.previous is None:
                 continue  # nothing to take back: the same question again
-            self.tell(answers)
-            if progress is not None:
-                progress(self)
+            self._take_in(answers)
+            self._advance(progress)
         return self
 
     def _waiting(self) -> list[Query]:
@@ -171,8 +174,8 @@ class Learner:
 
     # The four steps.
 
-    def _advance(self) -> None:
-        """Do what can be done without an answer."""
+    def _advance(self, progress: Callable[["Learner"], None] | None = None) -> None:
+        """Do what can be done without an answer; `progress` is called after each iteration."""
         while self.state.query is None and not self.finished:
             if not self.state.collected:
                 self._collect()
@@ -180,6 +183,8 @@ class Learner:
                 self._show()
             else:
                 self._improve()
+                if progress is not None:
+                    progress(self)
 
     def _collect(self) -> None:
         """Steps 3 and 4: new trajectories, and which of them to ask about."""

@@ -243,8 +243,8 @@ def test_an_expert_that_answers_nonsense_is_named_and_can_be_replaced():
     assert fingerprint(run.run(ReturnExpert())) == fingerprint(learner().run(ReturnExpert()))
 
 
-def test_the_expert_sees_the_two_in_the_order_shown_and_progress_follows_each_answer():
-    seen, progress = [], []
+def test_the_expert_sees_the_two_in_the_order_shown():
+    seen = []
     run = learner()
 
     def expert(first, second):
@@ -253,8 +253,16 @@ def test_the_expert_sees_the_two_in_the_order_shown_and_progress_follows_each_an
         seen.append(query.number)
         return "tie"
 
-    run.run(expert, progress=lambda run: progress.append(run.preferences.answers))
-    assert seen == progress == [1, 2, 3, 4]
+    run.run(expert)
+    assert seen == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("unasked", [0, 1])
+def test_progress_follows_each_iteration_also_one_that_asks_nothing(unasked):
+    progress = []
+    run = learner(iterations=3, unasked_iterations=unasked)
+    run.run(ReturnExpert(), progress=lambda run: progress.append((run.state.iteration, run.preferences.answers)))
+    assert progress == [(1, 2), (2, 2 if unasked else 3), (3, 3 if unasked else 4)]
 
 
 @pytest.mark.parametrize("answers_before", [1, 2, 3, 4])

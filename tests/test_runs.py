@@ -238,8 +238,10 @@ def test_a_run_in_progress_can_be_read_at_any_time(tmp_path):
     look(learner)
     bayespbrl.load(directory).policy.act(3)  # the first policy, before the first iteration
     assert bayespbrl.load(directory).estimate is None
+    learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    look(learner)
     learner.run(ReturnExpert(), progress=look)
-    assert states == [(0, 0, 0), (0, 0, 10), (1, 0, 10), (2, 1, 20), (3, 2, 30), (4, 3, 30)]
+    assert states == [(0, 0, 0), (0, 0, 10), (1, 0, 10), (2, 1, 10), (3, 2, 20), (4, 3, 30)]
 
 
 def test_a_finished_run_is_finished_when_resumed(copy):
