@@ -41,7 +41,8 @@ class RunOptions(TypedDict, total=False):
     hyperparameters: Annotated[
         str | None,
         typer.Option(
-            help="evidence: length scales, steepness and lapse rate by the answers; averaged over them; or given."
+            help="evidence: length scales, steepness and lapse rate by the answers; averaged over the first two; or "
+            "given."
         ),
     ]
     iterations: Annotated[int | None, typer.Option(help="Cycles of the four steps.")]
@@ -69,7 +70,7 @@ class RunOptions(TypedDict, total=False):
     wrong_answers: Annotated[float | None, typer.Option(help="Share of the simulated expert's answers turned round.")]
     policy: Annotated[str | None, typer.Option(help="auto, tabular, softmax, linear-gaussian or gaussian-process.")]
     centres: Annotated[int | None, typer.Option(help="Radial basis functions of each kind of feature.")]
-    max_steps: Annotated[int | None, typer.Option(help="Steps an episode, where the environment sets no limit.")]
+    max_steps: Annotated[int | None, typer.Option(help="Steps an episode, in place of the environment's own limit.")]
     expert: Annotated[str | None, typer.Option(help="return (simulated) or terminal (you).")]
 
 
@@ -98,6 +99,7 @@ def run(
     """Learn a task from preferences and keep the run in a directory."""
     from bayespbrl import runs
 
+    _expect_an_expert(options.get("expert"))
     run_to_the_end(runs.start(env, out, seed=seed, **options))
 
 
@@ -110,6 +112,7 @@ def resume(directory: Annotated[Path, typer.Argument(help="Directory of a run th
     if learner.finished:
         console.print(f"{directory}: this run is finished; nothing is left to do.")
         return
+    _expect_an_expert(learner.settings.expert)
     run_to_the_end(learner)
 
 
@@ -142,9 +145,13 @@ def trials(
     directory = out or Path("runs") / f"trials-{env.replace('/', '-').lower()}-{utility}"
     with progress_bar("{task.fields[state]}") as bar:
         task = bar.add_task("trials", total=number, state=f"{directory}")
-        study = run_trials(
-            env, directory, trials=number, jobs=jobs, seed=seed, progress=lambda _: bar.advance(task), **options
-        )
+        try:
+            study = run_trials(
+                env, directory, trials=number, jobs=jobs, seed=seed, progress=lambda _: bar.advance(task), **options
+            )
+        except KeyboardInterrupt:
+            console.print("Stopped. Nothing is lost: the same command goes on.")
+            raise
         bar.update(task, completed=number)
     print_trials(study)
     draw_trials(study)
@@ -154,7 +161,7 @@ def main() -> None:
     """Entry point: bad input is one line on standard error and exit status 2."""
     try:
         status = app(standalone_mode=False)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         status = _complain(str(error))
     except (KeyboardInterrupt, typer.Abort):
         status = 130
@@ -165,6 +172,16 @@ def main() -> None:
             raise
         status = _complain(error.format_message())
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _expect_an_expert(name: str | None) -> None:
+    """Nobody answers here for an expert of the user's own.
+
+    Raises:
+      ValueError: it is such a run.
+    """
+    if name == "other":
+        raise ValueError("expert: expected return or terminal, got other: such a run goes on in Python, Learner.run")
 
 
 def _complain(message: str) -> int:

@@ -47,7 +47,7 @@ class Learner:
       **settings: options of `Settings`, over the preset of the environment.
 
     Raises:
-      ValueError: an unknown environment or option, or a value out of range.
+      ValueError: an unknown environment or option, a value out of range, or no time limit known.
     """
 
     def __init__(
@@ -69,6 +69,7 @@ class Learner:
             schedule="other" if callable(schedule) else schedule,
             **settings,
         )
+        rollouts.step_limit(self.environment, self.settings.max_steps)  # or an error now, and not after the first step
         self.features = features
         self.schedule = schedule if callable(schedule) else _schedule(self.settings.schedule)
         self.log: Log | None = None

@@ -10,6 +10,7 @@ Resume, undo, a person who answers next week and a report on a run in progress a
 """
 
 import math
+import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -100,7 +101,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
                 state,
                 policy=entry.parts["policy"],
                 estimate=entry.parts["estimate"],
-                iteration=event["iteration"],
+                iteration=operator.index(event["iteration"]),
                 collected=False,
                 candidates=(),
                 wanted=0,

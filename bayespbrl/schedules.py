@@ -116,14 +116,18 @@ def decided(schedule: Schedule, situation: Situation) -> Bound:
     """What `schedule` decides, checked.
 
     Raises:
-      ValueError: anything but a positive finite number, naming the schedule.
+      ValueError: anything but a positive finite number, or statistics that are no plain numbers by name, naming the
+        schedule.
     """
     bound = schedule(situation)
+    name = getattr(schedule, "__name__", type(schedule).__name__)
     if not isinstance(bound, Bound):
         bound = Bound(bound, "by a schedule of the user's own")
     value = bound.kl_bound
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value <= 0:
-        name = getattr(schedule, "__name__", type(schedule).__name__)
         raise ValueError(f"schedule {name}: expected a positive finite KL bound, got {value!r}")
+    for key, figure in bound.statistics.items():
+        if not isinstance(key, str) or key == "reason" or not isinstance(figure, int | float | str | np.number):
+            raise ValueError(f"schedule {name}: expected statistics that are numbers by name, got {key!r}: {figure!r}")
     return Bound(float(value), bound.reason, dict(bound.statistics))

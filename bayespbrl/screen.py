@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-console = Console(soft_wrap=True)
+console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may hold square brackets
 
 
 def run_to_the_end(learner: Any) -> None:
@@ -56,8 +56,8 @@ def _run_with_bar(learner: Any) -> None:
 
 def progress_bar(state: str) -> Progress:
     """Of so many done of so many, with `state`, a template of the task's fields, behind it."""
-    columns = (TextColumn("{task.description} {task.completed}/{task.total}"), BarColumn(), TimeElapsedColumn())
-    return Progress(*columns, TextColumn(state), console=console)
+    done = TextColumn("{task.description} {task.completed}/{task.total}")
+    return Progress(done, BarColumn(), TimeElapsedColumn(), TextColumn(state, markup=False), console=console)
 
 
 def _state(learner: Any) -> str:

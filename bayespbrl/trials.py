@@ -2,11 +2,13 @@
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +79,7 @@ def run_trials(
       seed: the first.
       preference_within: how many iterations a trial has to meet a preference; where None, three for the acrobot, whose
         trajectories may all time out alike, and any number elsewhere.
-      progress: called with the seed of each trial that is finished.
+      progress: called with the seed of each trial that counts, also of those that were finished before.
       **settings: options of `Settings`.
 
     Raises:
@@ -193,12 +195,18 @@ def _in_parallel(seeds: _Seeds, jobs: int, progress: Callable[[int], None] | Non
     """Run in spawned processes what is left to do, and what is redrawn in its place."""
     failures: list[str] = []
     running: dict[Future[bool], int] = {}
+    before = multiprocessing.active_children()
     with (
         _environment(ONE_THREAD if jobs > 1 else {}),
         ProcessPoolExecutor(
             jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_the_study
         ) as pool,
+        _ending_at_once(pool, before),
     ):
+        seeds.to_do()
+        if progress is not None:
+            for seed in seeds.with_outcome(True):
+                progress(seed)
         started: set[int] = set()
         while True:
             for seed in seeds.to_do():
@@ -219,8 +227,27 @@ def _in_parallel(seeds: _Seeds, jobs: int, progress: Callable[[int], None] | Non
         raise ValueError(f"{len(failures)} of {seeds.trials} trials failed; the first: {failures[0]}")
 
 
+@contextmanager
+def _ending_at_once(pool: ProcessPoolExecutor, others: Sequence[BaseProcess]) -> Iterator[None]:
+    """Where the study is interrupted its trials end too, as if killed: each goes on where it stopped when called again.
+
+    `others` are child processes that are not the pool's.
+    """
+    try:
+        yield
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - set(others):
+            process.terminate()
+        raise
+
+
 def _end_with_the_study() -> None:
-    """In a trial's process: end when the study's does, be it killed, so that nobody goes on writing for it."""
+    """In a trial's process: end when the study's does, be it killed, so that nobody goes on writing for it.
+
+    An interrupt from the keyboard, which reaches all processes, is the study's to decide on.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     study = multiprocessing.parent_process()
 
     def wait_for_it() -> None:

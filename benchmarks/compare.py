@@ -68,6 +68,8 @@ def first(numbers: np.ndarray, values: np.ndarray, value: float, quantile: float
 def paired(study: Study, reference: Study, answers: float) -> str:
     """The median difference after so many answers, over the seeds of both, with its bootstrap interval."""
     seeds = [seed for seed in study.seeds if seed in reference.seeds]
+    if not seeds:
+        return "–"
     value, before = (one.at(answers)[[one.seeds.index(seed) for seed in seeds]] for one in (study, reference))
     differences = value - before
     chosen = np.random.default_rng(0).integers(len(seeds), size=(10_000, len(seeds)))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import bayespbrl
 from bayespbrl.cli import main
 from bayespbrl.screen import print_trials
 from bayespbrl.trials import Trials
@@ -110,6 +111,23 @@ def test_resuming_a_finished_run_says_so(monkeypatch, capsys, tmp_path):
     assert call(monkeypatch, "resume", out) == 0
     assert "finished" in capsys.readouterr().out
     assert (out / "events.jsonl").read_bytes() == before
+
+
+def test_nobody_answers_for_an_expert_of_the_users_own(monkeypatch, capsys, tmp_path):
+    assert "expert: expected return or terminal, got other" in refused(
+        monkeypatch, capsys, "run", "gridworld", *QUICK, "--expert", "other", "--out", tmp_path / "run"
+    )
+    assert not (tmp_path / "run").exists()
+    bayespbrl.start("gridworld", tmp_path / "own", utility="linear-program", iterations=2, expert="other").ask()
+    before = (tmp_path / "own" / "events.jsonl").read_bytes()
+    assert "got other" in refused(monkeypatch, capsys, "resume", tmp_path / "own")
+    assert (tmp_path / "own" / "events.jsonl").read_bytes() == before
+
+
+def test_a_path_with_square_brackets_is_shown_as_it_is(monkeypatch, capsys, tmp_path):
+    out = tmp_path / "[wide]" / "[/b]"
+    assert call(monkeypatch, "run", "gridworld", "--utility", "linear-program", "--iterations", "1", "--out", out) == 0
+    assert f"Run directory: {out}" in capsys.readouterr().out
 
 
 def test_a_run_without_out_gets_a_fresh_directory_under_runs(monkeypatch, tmp_path):

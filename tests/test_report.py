@@ -492,6 +492,27 @@ def test_whatever_is_missing_there_is_a_report(copy, damage):
     assert "policy's value" in text
 
 
+def test_an_iteration_that_is_no_number_ends_what_is_read_of_the_log(copy):
+    lines = (copy / "events.jsonl").read_text().splitlines()
+    broken = [
+        line.replace('"event": "improved", "iteration": 2', '"event": "improved", "iteration": "2"') for line in lines
+    ]
+    assert broken != lines
+    (copy / "events.jsonl").write_text("".join(line + "\n" for line in broken))
+    evidence = read_evidence(copy)
+    assert any("events.jsonl: event: expected a complete one" in text for text in warned(evidence))
+    assert "could not be made" not in read(write_report(copy)).text
+
+
+def test_summaries_without_answers_still_make_a_report(copy):
+    (copy / "events.jsonl").unlink()
+    summary = json.loads((copy / "summary.json").read_text())
+    for entry in summary["iterations"]:
+        del entry["answers"]
+    (copy / "summary.json").write_text(json.dumps(summary))
+    assert "policy's value" in read(write_report(copy)).text
+
+
 def test_a_wholly_gutted_run_has_a_report(copy):
     for name in ("events.jsonl", "summary.json"):
         (copy / name).write_text("nothing\n")

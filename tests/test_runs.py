@@ -195,6 +195,13 @@ def test_bad_options_leave_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_environment_without_a_time_limit_leaves_nothing_behind(tmp_path):
+    with pytest.raises(ValueError, match="CliffWalking-v1 states no time limit"):
+        bayespbrl.start("CliffWalking-v1", tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+    assert bayespbrl.start("CliffWalking-v1", tmp_path / "run", max_steps=5).settings.max_steps == 5
+
+
 def test_without_a_directory_a_fresh_one_is_made_under_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     one, two = start(None), start(None)

@@ -117,6 +117,12 @@ def test_a_schedule_that_decides_nonsense_is_named(value):
         decided(careless, situation(proposed()))
 
 
+@pytest.mark.parametrize("statistics", [{"gain": np.ones(2)}, {"gain": None}, {"reason": 1.0}, {1: 1.0}])
+def test_statistics_that_could_not_be_kept_are_named(statistics):
+    with pytest.raises(ValueError, match=r"schedule .*: expected statistics that are numbers by name, got"):
+        decided(lambda situation: Bound(0.2, "mine", statistics), situation(proposed()))
+
+
 @pytest.mark.parametrize("largest", [0.0, -1.0, float("nan"), float("inf")])
 def test_bad_options_are_refused(largest):
     with pytest.raises(ValueError, match="largest: expected"):

@@ -1,6 +1,8 @@
 import csv
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -152,7 +154,7 @@ def test_a_second_call_redraws_nothing_again_and_a_lost_trial_comes_back(redrawn
     shutil.rmtree(redrawn.path / "seed-8")
     finished = []
     again = run_trials("gridworld", redrawn.path, trials=3, progress=finished.append, **TIED)
-    assert finished == [8]
+    assert sorted(finished) == [5, 8, 9]  # two of them from before
     assert {file: file.stat().st_mtime_ns for file in before} == before
     np.testing.assert_array_equal(again.table["value"].values, values)
 
@@ -214,10 +216,12 @@ def test_bad_input_is_named_and_nothing_is_left(tmp_path, changes):
 
 
 @pytest.mark.slow
-def test_a_study_that_is_killed_takes_its_trials_with_it(tmp_path):
+@pytest.mark.parametrize("how", ["killed", "interrupted"])
+def test_a_study_that_is_stopped_takes_its_trials_with_it(tmp_path, how):
     command = [sys.executable, "-m", "bayespbrl", "trials", "gridworld", "--utility", "linear-program"]
-    options = ["--iterations", "100000", "--trials", "2", "--jobs", "2", "--out", str(tmp_path / "study")]
-    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as study:
+    options = ["--iterations", "100000", "--trials", "3", "--jobs", "2", "--out", str(tmp_path / "study")]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([*command, *options], **streams, start_new_session=True) as study:
         try:
             logs = [tmp_path / "study" / f"seed-{seed}" / "events.jsonl" for seed in (1000, 1001)]
             waited = time.monotonic() + 120
@@ -225,9 +229,16 @@ def test_a_study_that_is_killed_takes_its_trials_with_it(tmp_path):
                 assert time.monotonic() < waited
                 assert study.poll() is None
                 time.sleep(0.1)
+            if how == "interrupted":
+                os.killpg(study.pid, signal.SIGINT)  # as the terminal does: to the trials too
+                shown, _ = study.communicate(timeout=60)
         finally:
             study.kill()
         study.communicate(timeout=60)  # their end of the pipe is closed: they have ended
+    if how == "interrupted":
+        assert study.returncode == 130
+        assert b"Nothing is lost" in shown
+        assert not (tmp_path / "study" / "seed-1002").exists()
     lengths = [log.stat().st_size for log in logs]
     time.sleep(1.0)
     assert [log.stat().st_size for log in logs] == lengths

@@ -129,11 +129,9 @@ def _facts(evidence: Evidence) -> list[tuple[str, str]]:
         ("discount γ of ψ", f"{settings.psi_discount:g}"),
         ("policy", settings.policy),
         ("expert", expert),
-        *(
-            (name, str(getattr(settings, name)))
-            for name in ("schedule", "query", "hyperparameters")
-            if hasattr(settings, name)
-        ),
+        ("schedule", settings.schedule),
+        ("query", settings.query),
+        ("hyperparameters", settings.hyperparameters),
     ]
 
 

@@ -87,7 +87,7 @@ def plot_column(table: xr.Dataset, name: str, axes: Axes, *, label: str | None =
 
 
 def plot_states(table: xr.Dataset, values: np.ndarray, axes: Axes, *, label: str, **limits: Any) -> Axes:
-    """One number of each state: a map, a line, or coloured points, by the `kind` of a `utility_table`.
+    """One number of each state: a map, or coloured points, by the `kind` of a `utility_table`.
 
     Args:
       table: what `utility_table` returned.
@@ -98,14 +98,6 @@ def plot_states(table: xr.Dataset, values: np.ndarray, axes: Axes, *, label: str
     """
     kind, states = table.attrs["kind"], table["states"].values
     axes.set_facecolor("0.9")
-    if kind == "list":
-        axes.bar(states, values, color=SETTLED)
-        axes.set(xlabel="state", ylabel=label)
-        return axes
-    if kind == "line":
-        axes.plot(states[:, 0], values, color=SETTLED)
-        axes.set(xlabel="observation 0", ylabel=label)
-        return axes
     if kind == "grid":
         rows, columns = table.attrs["shape"]
         image: Any = axes.imshow(values.reshape(rows, columns), **limits)

@@ -103,7 +103,7 @@ def _folded(
     # what the fold asks of the heavy parts is that they are there
     parts = {"trajectories": [None] * settings.trajectories_per_iteration, "policy": None, "estimate": None}
     for event in log:
-        query, pairs, iteration = state.query, len(state.preferences.pairs), state.iteration + 1
+        query, pairs = state.query, len(state.preferences.pairs)
         try:
             state = events.replay(state, [Entry(event, parts)])
         except ValueError as error:
@@ -115,7 +115,7 @@ def _folded(
             after = len(state.preferences.pairs)
             row = after - 1 if after > pairs else None  # the pair that was asked about is the last of its answer's
             answer = Answer(event["answer"])
-            records.append(AnswerRecord(query.number, iteration, query.first, query.second, answer, row))
+            records.append(AnswerRecord(query.number, state.iteration + 1, query.first, query.second, answer, row))
     return state, records, collected
 
 

@@ -134,7 +134,7 @@ def q_draws(
 
     Returns:
       `q` (chain, draw, state, action), with the actions as a coordinate where they are numbers, and the attributes of
-      `return_draws`.
+      `return_draws`. Of an `AveragedUtility` they are those of the one setting that was sampled, not of the average.
 
     Raises:
       ValueError: an estimate without a posterior; no states or no actions.
@@ -177,7 +177,7 @@ def greedy_probabilities(q: xr.Dataset) -> xr.Dataset:
             "expected_loss": (values.max("action") - values.isel(action=choice)).mean(("chain", "draw")),
         },
         attrs=q.attrs,
-    ).drop_vars("action_of_mean", errors="ignore")
+    )
 
 
 def plot_returns(returns: xr.Dataset, axes: Axes) -> Axes:
