@@ -1,6 +1,7 @@
 """A run that is kept on disk: start it, resume it, load it."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import xarray as xr
 
 from bayespbrl import rollouts
 from bayespbrl.cycle import Learner
+from bayespbrl.envs.opening import as_given, from_plain, to_plain
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
 from bayespbrl.run_directory import RunDirectory, fresh_directory
@@ -89,7 +91,7 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
             had, expected = ("with", "it again as") if own == "other" else ("without", "no")
             raise ValueError(f"{log.path}: a run {had} {part} of the user's own: expected {expected} {part}=")
     try:
-        return Learner(
+        learner = Learner(
             name if env is None else env,
             features=features,
             policy=kind if policy is None else policy,
@@ -99,6 +101,9 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
         )
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
+    if replace(learner.settings, env=log.settings.env) != log.settings:
+        raise ValueError(f"{log.path}: expected settings that this version can give again, got {log.settings}")
+    return learner
 
 
 @dataclass(frozen=True)
@@ -119,8 +124,16 @@ class Run:
 
     @property
     def policy(self) -> Actor:
-        """The last policy: `run.policy.act(observation)` is an action for the environment."""
-        return Actor(self.learner.policy, self.learner.environment.action_space, np.random.default_rng())
+        """The last policy: `run.policy.act(observation)` is an action for the environment, as it was given."""
+        environment = self.learner.environment
+        given = as_given(environment)
+        return Actor(
+            self.learner.policy,
+            environment.action_space,
+            np.random.default_rng(),
+            observe=partial(to_plain, given.observation_space),
+            enact=partial(from_plain, given.action_space),
+        )
 
     @property
     def preferences(self) -> Preferences:

@@ -275,6 +275,15 @@ PRESETS["Pendulum-v1"] = PRESETS["swing-up"] | {
 }
 
 
+# An environment that the user made is known by its gymnasium id.
+PRESETS |= {
+    "bayespbrl/Gridworld-v0": PRESETS["gridworld"],
+    "bayespbrl/Bicycle-v0": PRESETS["bicycle"],
+    "bayespbrl/SwingUp-v0": PRESETS["swing-up"],
+    "bayespbrl/Acrobot-v0": PRESETS["acrobot"],
+}
+
+
 def settings_for(env: str, **changes: Any) -> Settings:
     """The preset of a domain (the defaults, for an environment without one) with `changes`; None changes nothing.
 

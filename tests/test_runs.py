@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import gymnasium
 import jax
@@ -19,6 +20,7 @@ import bayespbrl
 from bayespbrl import Learner, ReturnExpert, run_directory, runs
 from bayespbrl.policies import TabularPolicy
 from bayespbrl.run_directory import RunDirectory
+from bayespbrl.settings import PRESETS
 
 QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
 FILES = {"settings.json", "events.jsonl", "summary.json", "iterations"}
@@ -143,6 +145,45 @@ def test_the_policy_acts(finished):
     assert all(type(action) is int and 0 <= action < 5 for action in actions)
     key = jax.random.key(3)
     assert policy.act(np.int64(12), key=key) == policy.act(12, key=key) == policy(12, key=key)
+
+
+class Odd(gymnasium.Env):
+    """Spaces that the learner flattens and shifts."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2, 2))
+
+    def __init__(self, action_space):
+        self.action_space = action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, (2, 2)), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return self.np_random.uniform(-1, 1, (2, 2)), float(np.sum(action)), False, False, {}
+
+
+@pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(2, start=1), gymnasium.spaces.Box(-1, 1, (1, 2))])
+def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):
+    environment = Odd(space)
+    bayespbrl.start(environment, tmp_path / "run", **(QUICK | {"iterations": 1, "centres": 5})).run(ReturnExpert())
+    policy = bayespbrl.load(tmp_path / "run", env=environment).policy
+    observation, _ = environment.reset(seed=0)
+    for _ in range(8):
+        observation, *_ = environment.step(policy.act(observation))
+
+
+def test_settings_that_would_come_back_as_others_are_refused(tmp_path):
+    start(tmp_path / "run").ask()
+    file = tmp_path / "run" / "settings.json"
+    settings = json.loads(file.read_text())
+    settings["trajectory_discount"] = None  # as before the preset had one
+    file.write_text(json.dumps(settings))
+    refused = pytest.raises(ValueError, match="run: expected settings that this version can give again")
+    with mock.patch.dict(PRESETS["gridworld"], {"trajectory_discount": 1.0}), refused:
+        bayespbrl.load(tmp_path / "run")
+    assert bayespbrl.load(tmp_path / "run").settings.trajectory_discount is None
 
 
 def test_evaluation_is_a_function_of_the_seed(finished):

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.settings import PRESETS, Settings, settings_for
 
 NAN, INFINITY = float("nan"), float("inf")
@@ -94,6 +95,11 @@ def test_changes_win_over_presets_and_none_changes_nothing():
 def test_every_preset_is_valid_and_survives_json(env):
     settings = settings_for(env, seed=5)
     assert Settings(**json.loads(json.dumps(dataclasses.asdict(settings)))) == settings
+
+
+@pytest.mark.parametrize(("short", "name"), SHORT_NAMES.items())
+def test_a_preset_is_found_by_short_name_and_by_id(short, name):
+    assert PRESETS[name] is PRESETS[short]
 
 
 @pytest.mark.parametrize("value", [1e-6, 1, np.float64(0.3)])

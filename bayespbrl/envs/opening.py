@@ -16,6 +16,8 @@ from bayespbrl.envs.functional import FunctionalEnv
 
 # Environments that we made from an id, and that can therefore be made again, N at a time.
 _MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
+# What `flattened` was given, where it had something to do.
+_GIVEN: WeakKeyDictionary[gymnasium.Env, gymnasium.Env] = WeakKeyDictionary()
 
 
 def open_environment(environment: str | EnvSpec | gymnasium.Env | FuncEnv) -> gymnasium.Env:
@@ -85,7 +87,7 @@ def _one_line(error: Exception) -> str:
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
     """`env` with 1-D `Box` spaces and `Discrete` spaces counted from 0; `env` itself where nothing is to be done."""
-    observations, actions = env.observation_space, env.action_space
+    given, observations, actions = env, env.observation_space, env.action_space
     for kind, space in (("observation", observations), ("action", actions)):
         if not isinstance(space, Box | Discrete) or (
             kind == "action" and isinstance(space, Box) and not np.issubdtype(space.dtype, np.floating)
@@ -95,10 +97,17 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
                 f"{kind} space, got {space}"
             )
     if (plain := _plain_space(observations)) is not observations:
-        env = TransformObservation(env, lambda value: _to_plain(observations, value), plain)
+        env = TransformObservation(env, lambda value: to_plain(observations, value), plain)
     if (plain := _plain_space(actions)) is not actions:
-        env = TransformAction(env, lambda value: _from_plain(actions, value), plain)
+        env = TransformAction(env, lambda value: from_plain(actions, value), plain)
+    if env is not given:
+        _GIVEN[env] = given
     return env
+
+
+def as_given(env: gymnasium.Env) -> gymnasium.Env:
+    """The environment that `flattened` made `env` of: the user's, with the spaces that it really has."""
+    return _GIVEN.get(env, env)
 
 
 def _plain_space(space: Any) -> Any:
@@ -109,9 +118,11 @@ def _plain_space(space: Any) -> Any:
     return space if space.start == 0 else Discrete(int(space.n))
 
 
-def _to_plain(space: Any, value: Any) -> Any:
+def to_plain(space: Any, value: Any) -> Any:
+    """An observation or action of `space` as the flattened environment has it."""
     return np.reshape(value, -1) if isinstance(space, Box) else np.int64(value - space.start)
 
 
-def _from_plain(space: Any, value: Any) -> Any:
+def from_plain(space: Any, value: Any) -> Any:
+    """The way back of `to_plain`."""
     return np.reshape(value, space.shape) if isinstance(space, Box) else np.int64(value + space.start)

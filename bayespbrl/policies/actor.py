@@ -1,5 +1,6 @@
 """A policy put to work: one observation in, one action for the environment out."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,22 +18,28 @@ class Actor:
 
     Attributes:
       policy: any `Policy`.
-      action_space: of the environment.
+      action_space: that the policy knows.
       rng: where a call without a key draws from.
+      observe: from an observation of the environment to one that the policy knows.
+      enact: from an action that the policy knows to one of the environment.
     """
 
     policy: Any
     action_space: Space
     rng: np.random.Generator
+    observe: Callable[[Any], Any] = np.asarray
+    enact: Callable[[Any], Any] = np.asarray
 
     def act(self, observation: Any, *, key: jax.Array | None = None) -> Any:
         """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete."""
         if key is None:
             key = jax.random.key(int(self.rng.integers(2**31)))
+        observation = self.observe(observation)
         dtype = np.int64 if np.ndim(observation) == 0 else np.float64
         action = sample_actions(self.policy, key, np.asarray(observation, dtype=dtype)[None])[0]
         if isinstance(self.action_space, Box):
-            return np.clip(action, self.action_space.low, self.action_space.high).astype(self.action_space.dtype)
-        return int(action)
+            action = np.clip(action, self.action_space.low, self.action_space.high).astype(self.action_space.dtype)
+            return self.enact(action)
+        return int(self.enact(action))
 
     __call__ = act
