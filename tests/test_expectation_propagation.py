@@ -4,7 +4,15 @@ import pytest
 from scipy import integrate
 
 from bayespbrl.models.expectation_propagation import expectation_propagation, tilted_moments
-from bayespbrl.models.likelihoods import Logistic, Mixed, Probit, WithLapses, WithTies, log_prob
+from bayespbrl.models.likelihoods import (
+    Logistic,
+    Mixed,
+    Probit,
+    WithLapses,
+    WithTies,
+    log_prob,
+    preference_likelihood,
+)
 
 LIKELIHOODS = [Mixed(5.0, 3.0), Mixed(200.0, 41.0), Mixed(0.01, 2.0), Logistic(3.0), WithLapses(Mixed(5.0, 3.0), 0.2)]
 
@@ -70,12 +78,54 @@ def test_contradictory_answers_leave_a_proper_gaussian():
         np.testing.assert_allclose(fit.mean, 0, atol=1e-6)
 
 
-def test_answers_that_contradict_each_other_about_the_same_margin_do_not_run_away():
-    # 5 for and 3 against a margin, beside one about another: the steps alone, which have no scale, decide
-    loadings = np.array([[0.01, 0.0]] * 5 + [[-0.01, 0.0]] * 3 + [[0.3, 0.9]])
-    fit = expectation_propagation(loadings, Mixed(5.0, 26.0).probit_mixture(), prior_scale=1.0)
+def test_answers_that_contradict_each_other_about_nearly_the_same_margin_do_not_run_away():
+    # 8 for and 5 against, beside one about another: the steps alone, which have no scale, decide
+    loadings = np.array([[1.0, 0.0, 0.0]] * 8 + [[-1.0, 0.0, 0.0]] * 5 + [[0.3, 0.9, 0.1]])
+    loadings[:13, 1:] += 1e-4 * np.random.default_rng(0).normal(size=(13, 2))
+    fit = expectation_propagation(loadings, Mixed(5.0, 14.0).probit_mixture(), prior_scale=1.0)
+    assert not fit.converged  # not every answer has a part in it
+    assert np.any(fit.site_precisions[:13] == 0)
+    assert fit.site_precisions[13] > 0
+    assert np.all(np.linalg.eigvalsh(fit.covariance) > 1e-6)
+
+
+@pytest.mark.parametrize(("first", "second"), [(12, 4), (6, 2), (2, 1), (20, 0)])
+@pytest.mark.parametrize(("steepness", "lapse_rate"), [(5.0, 0.0), (1.0, 0.0), (5.0, 0.1)])
+def test_answers_about_one_margin_are_one_factor_and_so_exact(first, second, steepness, lapse_rate):
+    ratios = np.where(np.arange(first + second) % 3, 1.0, 0.2) * np.repeat([1.0, -1.0], [first, second])
+    likelihood = preference_likelihood(
+        "mixed", steepness=steepness, number_of_preferences=len(ratios), lapse_rate=lapse_rate
+    )
+    loadings = ratios[:, None] * [0.6, 0.8]
+    fit = expectation_propagation(loadings, likelihood.probit_mixture(), prior_scale=1.0)
+    t = np.linspace(-8, 8, 200_001)
+    log_density = sum(np.log(_probability(likelihood, ratio * t)) for ratio in ratios) - 0.5 * t**2
+    density = np.exp(log_density) / np.sqrt(2 * np.pi)
+    exact = integrate.trapezoid(density, t)
+    mean = integrate.trapezoid(t * density, t) / exact
+    variance = integrate.trapezoid((t - mean) ** 2 * density, t) / exact
     assert fit.converged
-    assert np.all(np.linalg.eigvalsh(fit.covariance) > 0.1)
+    assert abs(fit.log_evidence - np.log(exact)) < 0.05
+    np.testing.assert_allclose(fit.mean, mean * np.array([0.6, 0.8]), atol=0.01)
+    np.testing.assert_allclose(np.linalg.eigvalsh(fit.covariance), [variance, 1.0], atol=0.01)
+    assert np.count_nonzero(fit.site_precisions) == 1
+
+
+def test_ties_and_orders_about_one_margin_are_one_factor():
+    likelihood = WithTies(Logistic(5.0), 0.2, np.array([True, False, False, False]))
+    ratios = np.array([1.0, -2.0, 1.0, 1.0])
+    fit = expectation_propagation(ratios[:, None], likelihood.probit_mixture(), prior_scale=1.0)
+    p = lambda x: 1 / (1 + np.exp(-5 * x))  # noqa: E731
+    t = np.linspace(-8, 8, 200_001)
+    density = (p(t + 0.2) - p(t - 0.2)) * p(-2 * t - 0.2) * p(t - 0.2) ** 2 * np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi)
+    exact = integrate.trapezoid(density, t)
+    np.testing.assert_allclose(fit.log_evidence, np.log(exact), atol=0.02)
+    np.testing.assert_allclose(fit.mean, integrate.trapezoid(t * density, t) / exact, atol=0.01)
+
+
+def _probability(likelihood, margins):
+    with jax.enable_x64(True):
+        return np.exp(np.asarray(log_prob(likelihood, margins)))
 
 
 def test_no_answers_leave_the_prior():

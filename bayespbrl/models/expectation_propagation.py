@@ -2,20 +2,30 @@
 
 Each answer's factor p_k(t_k) is replaced by a Gaussian in t_k; all factors are updated at once, damped. It is done in
 NumPy because it is a handful of small dense factorisations, once for each fit.
+
+Answers about the same margin up to a number, as when two trajectories are compared again, are one factor, whose moments
+are found by quadrature. Gaussians of their own would each be fitted to what the others leave, and of twelve answers for
+and four against a margin those of the four alone may be left.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, ndtr
 
 from bayespbrl.models.likelihoods import ProbitMixture
 
 # Prior variance of a margin over that of its site, beyond which the site is taken for a runaway. A step has no scale:
-# answers that contradict each other about the same margin (the same trajectories compared twice, say) each cut a part
-# off whatever the others leave, and their sites grow by a factor at every sweep, until the linear algebra breaks down
-# near 1e16. Sites that settle stay far below: 1e5 with 320 random answers about nearly the same margins.
+# answers that contradict each other about nearly the same margin each cut a part off whatever the others leave, and
+# their sites grow by a factor at every sweep, until the linear algebra breaks down near 1e16. Sites that settle stay
+# far below: 1e5 with 320 random answers about nearly the same margins.
 RUNAWAY = 1e12
+SAME = 1e-10  # of the cosine between two rows of L, below 1, where they are about the same margin
+# Panels on which one factor of several answers is integrated: they shrink towards the steps, and go on to where the
+# Gaussian ends, in its standard deviations.
+SHRINKING, WIDE = np.geomspace(1e-7, 1, 60), np.linspace(-12, 12, 97)
+NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 @dataclass(frozen=True)
@@ -25,11 +35,13 @@ class GaussianApproximation:
     Attributes:
       mean: shape (r,).
       covariance: shape (r, r).
-      site_precisions, site_shifts: the factors exp(−τ t²/2 + ν t) that stand for the answers, shapes (K,); zero where
-        there is none, because the answer is contradicted by others about the same margin.
+      site_precisions, site_shifts: the factors exp(−τ t²/2 + ν t) that stand for the answers, shapes (K,); of several
+        about the same margin the first has the factor of all. Zero where there is none, because the answer is
+        contradicted by others about nearly the same margin.
       log_evidence: expectation propagation's log ∫ p(answers | z) p(z) dz.
       sweeps: updates of all factors that were done.
-      converged: whether the last update changed the margins' means and standard deviations by less than the tolerance.
+      converged: whether the last update changed the margins' means and standard deviations by less than the tolerance,
+        and every answer has a part in a factor.
     """
 
     mean: np.ndarray
@@ -63,6 +75,81 @@ def tilted_moments(
     return top[:, 0] + np.log(z), means + variances * slope, np.maximum(tilted_variance, 1e-12 * variances)
 
 
+def repeated_moments(
+    mean: float, variance: float, ratios: np.ndarray, mixture: ProbitMixture
+) -> tuple[float, float, float]:
+    """log Z, mean and variance of N(t; mean, variance) Πₖ pₖ(ratiosₖ t) / Z by quadrature: n answers about one margin.
+
+    `mixture` has a constant and a row of weights for each of the n.
+    """
+    deviation = np.sqrt(variance)
+    steps = np.unique(np.append(mixture.offsets / ratios[:, None], 0.0))
+    near = SHRINKING * (np.max(np.abs(steps)) + abs(mean) + 12 * deviation)
+    edges = np.unique(
+        np.concatenate([(steps[:, None] + np.append(-near, near)).ravel(), steps, mean + deviation * WIDE])
+    )
+    edges = edges[np.abs(edges - mean) <= 12 * deviation]
+    halves = np.diff(edges)[:, None] / 2
+    t, widths = ((edges[:-1, None] + halves) + halves * NODES).ravel(), (halves * NODE_WEIGHTS).ravel()
+    log_density = -0.5 * (t - mean) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)
+    for ratio, constant, weights in zip(ratios, np.asarray(mixture.constant), mixture.weights, strict=True):
+        distance = ratio * t[:, None] - mixture.offsets
+        with np.errstate(divide="ignore"):
+            cdf = np.where(mixture.scales > 0, ndtr(distance / mixture.scales), distance > 0)
+        log_density += np.log(np.maximum(constant + cdf @ weights, np.finfo(float).tiny))
+    top = log_density.max()
+    density = np.exp(log_density - top) * widths
+    z = density.sum()
+    tilted = density @ t / z
+    return float(top + np.log(z)), float(tilted), float(density @ (t - tilted) ** 2 / z)
+
+
+def _same_margins(loadings: np.ndarray) -> list[np.ndarray]:
+    """The rows of L in groups that are parallel, in the order of the first of each."""
+    gram = loadings @ loadings.T
+    lengths = np.sqrt(np.diag(gram))
+    parallel = np.abs(gram) >= (1 - SAME) * np.outer(lengths, lengths)
+    groups, free = [], np.ones(len(loadings), dtype=bool)
+    for row in range(len(loadings)):
+        if free[row]:
+            groups.append(np.flatnonzero(parallel[row] & free))
+            free[groups[-1]] = False
+    return groups
+
+
+class _Factors:
+    """The likelihood as a function of one margin for each of G groups of answers."""
+
+    def __init__(self, loadings: np.ndarray, mixture: ProbitMixture):
+        groups = _same_margins(loadings)
+        self.first = np.array([group[0] for group in groups], dtype=int)
+        rows = ProbitMixture(
+            np.broadcast_to(mixture.constant, len(loadings)),
+            np.broadcast_to(mixture.weights, (len(loadings), len(mixture.offsets))),
+            mixture.offsets,
+            mixture.scales,
+        )
+        self.mixture = mixture if np.ndim(mixture.weights) == 1 else _rows(rows, self.first)
+        self.repeated = [
+            (number, loadings[group] @ loadings[group[0]] / np.sum(loadings[group[0]] ** 2), _rows(rows, group))
+            for number, group in enumerate(groups)
+            if len(group) > 1
+        ]
+
+    def moments(self, means: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`tilted_moments` of each group's margin, that of its first answer."""
+        log_z, tilted, narrowed = tilted_moments(means, variances, self.mixture)
+        for number, ratios, mixture in self.repeated:
+            log_z[number], tilted[number], narrowed[number] = repeated_moments(
+                means[number], variances[number], ratios, mixture
+            )
+        return log_z, tilted, narrowed
+
+
+def _rows(mixture: ProbitMixture, rows: Sequence[int] | np.ndarray) -> ProbitMixture:
+    return mixture._replace(constant=np.asarray(mixture.constant)[rows], weights=mixture.weights[rows])
+
+
 def expectation_propagation(
     loadings: np.ndarray,
     mixture: ProbitMixture,
@@ -82,6 +169,8 @@ def expectation_propagation(
       damping: share of each update that is taken, in (0, 1]; reduced whenever the changes grow.
       tolerance: change of the margins' moments, in standard deviations, that counts as none.
     """
+    factors, answers = _Factors(loadings, mixture), len(loadings)
+    loadings = loadings[factors.first]
     number = len(loadings)
     precisions, shifts = np.zeros(number), np.zeros(number)
     gaussian = prior = _moments(loadings, precisions, shifts, prior_scale)
@@ -93,7 +182,7 @@ def expectation_propagation(
         cavity = 1 / np.maximum(1 - t_variance * precisions, 1e-10)
         cavity_variance = t_variance * cavity
         cavity_mean = (t_mean - t_variance * shifts) * cavity
-        _, mean, variance = tilted_moments(cavity_mean, cavity_variance, mixture)
+        _, mean, variance = factors.moments(cavity_mean, cavity_variance)
         # a violated answer's factor can widen its margin: its precision is held at 0, its shift keeps the tilted mean
         new_precisions = np.maximum(1 / variance - 1 / cavity_variance, 0.0)
         new_shifts = mean * (new_precisions + 1 / cavity_variance) - cavity_mean / cavity_variance
@@ -112,8 +201,11 @@ def expectation_propagation(
         converged = change <= tolerance
         damping, last = (0.8 * damping if change > last else damping), change
     mean, covariance, *_ = gaussian
-    evidence = _log_evidence(gaussian, precisions, shifts, mixture) if number else 0.0
-    return GaussianApproximation(mean, covariance, precisions, shifts, evidence, sweeps, converged or not number)
+    evidence = _log_evidence(gaussian, precisions, shifts, factors) if number else 0.0
+    site_precisions, site_shifts = np.zeros((2, answers))
+    site_precisions[factors.first], site_shifts[factors.first] = precisions, shifts
+    converged = not number or (converged and not held.any())
+    return GaussianApproximation(mean, covariance, site_precisions, site_shifts, evidence, sweeps, converged)
 
 
 def _moments(loadings, precisions, shifts, prior_scale):
@@ -132,12 +224,12 @@ def _moments(loadings, precisions, shifts, prior_scale):
     return mean, covariance, half.T @ direction, np.sum(half**2, axis=0), float(log_normaliser)
 
 
-def _log_evidence(gaussian, precisions, shifts, mixture):
+def _log_evidence(gaussian, precisions, shifts, factors):
     """Σ_k [log Z_k(cavity) − log ∫ cavity · site] + log ∫ prior · sites (Rasmussen & Williams 2006, eq. 3.65)."""
     _, _, t_mean, t_variance, log_normaliser = gaussian
     cavity = 1 / np.maximum(1 - t_variance * precisions, 1e-10)
     variance, mean = t_variance * cavity, (t_mean - t_variance * shifts) * cavity
-    log_tilted, _, _ = tilted_moments(mean, variance, mixture)
+    log_tilted, _, _ = factors.moments(mean, variance)
     grown = 1 + variance * precisions
     # ∫ N(t; mean, variance) exp(−τ t²/2 + ν t) dt
     log_site = -0.5 * np.log(grown) + (shifts * mean + 0.5 * variance * shifts**2 - 0.5 * precisions * mean**2) / grown
