@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from bayespbrl import averaging, events, evidence, improvement, queries, rollouts, schedules, utility
-from bayespbrl.envs.opening import environment_name
+from bayespbrl.envs.opening import environment_name, told
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import StateActionFeatures, checked_features, draw_state_action_features, draw_state_features
@@ -410,7 +410,7 @@ class Learner:
 
     @property
     def _period(self) -> Any:
-        return getattr(getattr(self.environment.unwrapped, "dynamics", None), "observation_period", None)
+        return told(self.environment, "observation_period")
 
     # Memory and chance.
 

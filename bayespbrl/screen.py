@@ -7,6 +7,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from bayespbrl.envs.opening import told
+
 console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may hold square brackets
 
 
@@ -104,13 +106,9 @@ def _table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     console.print(table)
 
 
-def _optimum(environment: Any) -> float | None:
-    return getattr(getattr(environment.unwrapped, "dynamics", None), "optimal_return", None)
-
-
 def _print_iterations(learner: Any) -> None:
     """A row for the first iteration, every fifth and the last, narrow enough for eighty columns."""
-    optimum = _optimum(learner.environment)
+    optimum = told(learner.environment, "optimal_return")
     quiet = len({s["answers"] for s in learner.iterations}) < len(learner.iterations)  # answers do not tell them apart
     rows = [
         [
@@ -136,7 +134,7 @@ def print_trials(study: Any) -> None:
     from bayespbrl.rollouts import open_environment
 
     table, quartiles = study.table, study.quartiles()
-    optimum = _optimum(open_environment(table.attrs["env"]))
+    optimum = told(open_environment(table.attrs["env"]), "optimal_return")
     names = ("lower_quartile", "median", "upper_quartile")
     rows = []
     for answers in quartiles["answers"].values:

@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from bayespbrl.cycle import Learner
+from bayespbrl.envs.opening import told
 from bayespbrl.trajectories import Transitions, transitions
 
 
@@ -54,9 +55,8 @@ def trials_figure(quartiles: xr.Dataset, environment: Any, title: str) -> Figure
     """`quartile_curve` with the levels that the environment knows: its optimum, and returns published by others."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
-    dynamics = getattr(environment.unwrapped, "dynamics", None)
-    levels = dict(getattr(dynamics, "published_returns", {}))
-    optimum = getattr(dynamics, "optimal_return", None)
+    levels = dict(told(environment, "published_returns") or {})
+    optimum = told(environment, "optimal_return")
     axes = quartile_curve(
         quartiles, figure.subplots(), levels=levels | ({} if optimum is None else {"optimal": optimum})
     )
@@ -72,7 +72,7 @@ def utility_beside_reward(learner: Learner, utility_axes: Axes, reward_axes: Axe
     """
     steps = transitions(learner.trajectories)
     utilities = learner.estimate.step_utilities(steps)
-    shape = getattr(getattr(learner.environment.unwrapped, "dynamics", None), "grid_shape", None)
+    shape = told(learner.environment, "grid_shape")
     if shape is not None:
         draw = _map_of_cells
     elif steps.states.ndim == 2 and steps.states.shape[1] == 2:
@@ -93,8 +93,7 @@ def run_figure(learner: Learner) -> Figure:
     figure = Figure(figsize=(13, 4), layout="constrained")
     FigureCanvasAgg(figure)
     curve, utility, reward = figure.subplots(1, 3)
-    dynamics = getattr(learner.environment.unwrapped, "dynamics", None)
-    learning_curve(learner.iterations, curve, optimum=getattr(dynamics, "optimal_return", None))
+    learning_curve(learner.iterations, curve, optimum=told(learner.environment, "optimal_return"))
     utility_beside_reward(learner, utility, reward)
     return figure
 

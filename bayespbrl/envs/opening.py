@@ -58,6 +58,11 @@ def environment_name(env: gymnasium.Env) -> str:
     return type(inner.dynamics if isinstance(inner, FunctionalEnv) else inner).__name__
 
 
+def told(env: gymnasium.Env, name: str) -> Any:
+    """What an environment's pure functions tell beyond gymnasium, `optimal_return` or `grid_shape`; None if nothing."""
+    return getattr(getattr(env.unwrapped, "dynamics", None), name, None)
+
+
 def _spec(environment: str | EnvSpec) -> EnvSpec:
     if isinstance(environment, EnvSpec):
         return environment
