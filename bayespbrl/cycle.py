@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from bayespbrl import averaging, events, evidence, improvement, queries, rollouts, schedules, utility
-from bayespbrl.envs.opening import environment_name, told
+from bayespbrl.envs.opening import environment_name, given_by_name, told
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import StateActionFeatures, checked_features, draw_state_action_features, draw_state_features
@@ -61,11 +61,14 @@ class Learner:
         **settings: Any,
     ):
         self.environment = rollouts.open_environment(env)
+        if "environment" in settings:
+            raise ValueError("settings: expected env alone to say which environment, got environment too")
         own_policy = None if policy is None or isinstance(policy, str) else policy
         self.settings: Settings = settings_for(
             env if isinstance(env, str) else environment_name(self.environment),
             policy=policy if own_policy is None else "other",
             features="drawn" if features is None else "other",
+            environment="named" if given_by_name(env) else "other",
             schedule="other" if callable(schedule) else schedule,
             **settings,
         )

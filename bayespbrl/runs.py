@@ -90,6 +90,8 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
         if (own == "other") != (given is not None):
             had, expected = ("with", "it again as") if own == "other" else ("without", "no")
             raise ValueError(f"{log.path}: a run {had} {part} of the user's own: expected {expected} {part}=")
+    if settings.pop("environment") == "other" and env is None:
+        raise ValueError(f"{log.path}: a run with an environment of the user's own: expected it again as env=")
     try:
         learner = Learner(
             name if env is None else env,
@@ -101,7 +103,8 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
         )
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
-    if replace(learner.settings, env=log.settings.env) != log.settings:
+    named = {name: getattr(log.settings, name) for name in ("env", "environment")}  # another object may be passed
+    if replace(learner.settings, **named) != log.settings:
         raise ValueError(f"{log.path}: expected settings that this version can give again, got {log.settings}")
     return learner
 

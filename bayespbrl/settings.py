@@ -13,6 +13,7 @@ CHOICES = {
     "query": QUERIES,
     "policy": ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other"),
     "features": ("drawn", "other"),
+    "environment": ("named", "other"),
     "schedule": ("constant", "confidence", "other"),
     "hyperparameters": ("evidence", "given", "averaged"),
     "expert": ("return", "terminal", "other"),
@@ -76,6 +77,7 @@ class Settings:
       policy: the kind of policy; `auto` takes tabular for discrete states, softmax for discrete actions in continuous
         states, gaussian-process otherwise; `other` stands for a policy of the user's.
       features: φ(s) as `drawn` by the settings, or `other`, a function of the user's.
+      environment: `named`, which `env` opens again, or `other`, an object of the user's that is not.
       evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
       max_steps: steps an episode; None for the environment's own limit.
       centres: radial basis functions of each kind of feature.
@@ -117,6 +119,7 @@ class Settings:
     trajectory_discount: float | None = None
     policy: str = "auto"
     features: str = "drawn"
+    environment: str = "named"
     evaluation_episodes: int = 100
     max_steps: int | None = None
     centres: int = 300

@@ -18,6 +18,7 @@ import xarray as xr
 
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert, run_directory, runs
+from bayespbrl.diagnostics.report import write_report
 from bayespbrl.policies import TabularPolicy
 from bayespbrl.run_directory import RunDirectory
 from bayespbrl.settings import PRESETS
@@ -574,7 +575,7 @@ def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_c
     learner = bayespbrl.start(Corridor(), directory, **options).run(ReturnExpert())
     assert len({len(trajectory) for trajectory in learner.trajectories}) > 1
     assert any(trajectory.terminated for trajectory in learner.trajectories)
-    with pytest.raises(ValueError, match="Corridor"):
+    with pytest.raises(ValueError, match="run: a run with an environment of the user's own: expected it again as env="):
         bayespbrl.load(directory)
     run = bayespbrl.load(directory, env=Corridor())
     assert fingerprint(run.learner) == fingerprint(learner)
@@ -583,6 +584,33 @@ def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_c
     stopped.tell([ReturnExpert()(*stopped.ask()[0].trajectories)])
     resumed = runs.resume(tmp_path / "stopped", env=Corridor()).run(ReturnExpert())
     assert fingerprint(resumed) == fingerprint(learner)
+
+
+@pytest.mark.parametrize("how", ["arguments", "wrapper", "limit"])
+def test_an_environment_that_its_name_would_not_give_again_has_to_be_passed(tmp_path, how):
+    def made():
+        environment = gymnasium.make(
+            "Pendulum-v1", **{"arguments": {"g": 2.0}, "limit": {"max_episode_steps": 9}}.get(how, {})
+        )
+        return gymnasium.wrappers.ClipReward(environment, -1.0, 0.0) if how == "wrapper" else environment
+
+    options = {"utility": "linear-program", "iterations": 1, "max_steps": 5, "evaluation_episodes": 1, "centres": 5}
+    bayespbrl.start(made(), tmp_path / "run", **options).run(ReturnExpert())
+    for read in (bayespbrl.load, runs.resume):
+        with pytest.raises(ValueError, match="environment of the user's own: expected it again as env="):
+            read(tmp_path / "run")
+    assert bayespbrl.load(tmp_path / "run", env=made()).settings.environment == "other"
+    assert "Pendulum-v1 was an object of the user's" in write_report(tmp_path / "run", format="md").read_text(
+        encoding="utf-8"
+    )
+
+
+def test_an_environment_as_its_name_makes_it_need_not_be_passed_again(tmp_path):
+    environment = gymnasium.make("bayespbrl/Gridworld-v0", render_mode="rgb_array")
+    learner = bayespbrl.start(environment, tmp_path / "run", **QUICK)
+    assert learner.settings.discount == 0.995  # the preset's
+    learner.run(ReturnExpert())
+    assert fingerprint(bayespbrl.load(tmp_path / "run").learner) == fingerprint(learner)
 
 
 @pytest.mark.parametrize("policy", ["linear-gaussian", pytest.param("gaussian-process", marks=pytest.mark.slow)])

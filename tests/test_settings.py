@@ -15,6 +15,7 @@ BAD = {
     "likelihood": ["eq8", None],
     "policy": ["neural", None],
     "features": ["mine"],
+    "environment": ["mine"],
     "query": ["entropy", "", None, 1],
     "expert": ["oracle"],
     "iterations": [0, -3, 2.0, True, "25", None, NAN],

@@ -87,7 +87,7 @@ def read_evidence(directory: Path | str, *, env: Any = None, features: Any = Non
     run = RunDirectory.open(directory)
     log = read_log(run.path, run.settings)
     broken, records = list(log.broken), list(log.answers)
-    environment = _environment(run.settings.env if env is None else env, broken)
+    environment = _environment(run.settings, env, broken)
     reader = _Reader(run, features, broken)
     for number in range(1, max(log.collected, len(log.summaries)) + 1):
         records = reader.read(number, records, improved=number <= len(log.summaries))
@@ -172,9 +172,11 @@ class _Reader:
         return AnswerRecord(**{**vars(record), "predicted": probability})
 
 
-def _environment(env: Any, broken: list[str]) -> Any:
+def _environment(settings: Settings, env: Any, broken: list[str]) -> Any:
     try:
-        return open_environment(env)
+        if env is None and settings.environment == "other":
+            raise ValueError(f"{settings.env} was an object of the user's, and is passed to bayespbrl.load as env=")
+        return open_environment(settings.env if env is None else env)
     except ValueError as error:
         broken.append(f"The environment cannot be opened ({error}): what needs it is left out.")
         return None

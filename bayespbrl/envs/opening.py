@@ -58,6 +58,19 @@ def environment_name(env: gymnasium.Env) -> str:
     return type(inner.dynamics if isinstance(inner, FunctionalEnv) else inner).__name__
 
 
+def given_by_name(environment: Any) -> bool:
+    """Whether the name alone opens the same again: not so what was made with other arguments, wrapped, or registered
+    nowhere."""
+    if isinstance(environment, str):
+        return True
+    spec = environment if isinstance(environment, EnvSpec) else getattr(environment, "spec", None)
+    if spec is None or (registered := gymnasium.registry.get(spec.id)) is None:
+        return False
+    kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+    limit = spec.max_episode_steps == registered.max_episode_steps
+    return limit and not spec.additional_wrappers and kwargs == registered.kwargs
+
+
 def told(env: gymnasium.Env, name: str) -> Any:
     """What an environment's pure functions tell beyond gymnasium, `optimal_return` or `grid_shape`; None if nothing."""
     return getattr(getattr(env.unwrapped, "dynamics", None), name, None)
