@@ -82,7 +82,6 @@ def _takes_run_options(command: Callable[..., None]) -> Callable[..., None]:
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
         for name, kind in get_type_hints(RunOptions, include_extras=True).items()
     ]
-    named.sort(key=lambda p: p.kind)
     vars(command)["__signature__"] = inspect.Signature([named[0], *options, *named[1:]])
     return command
 

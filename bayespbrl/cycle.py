@@ -4,11 +4,12 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 
 from bayespbrl import averaging, events, evidence, improvement, queries, rollouts, schedules, utility
-from bayespbrl.envs.opening import environment_name, given_by_name, told
+from bayespbrl.envs.opening import as_given, environment_name, given_by_name, told
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import StateActionFeatures, checked_features, draw_state_action_features, draw_state_features
@@ -44,6 +45,7 @@ class Learner:
       policy: a kind of policy by name, as of `Settings`, or a first policy of your own.
       schedule: of the KL bound by name, as of `Settings`, or one of your own (`bayespbrl.schedules`).
       entries: events of a run to continue.
+      kept: the settings of that run, which hold then as they are.
       **settings: options of `Settings`, over the preset of the environment.
 
     Raises:
@@ -58,13 +60,15 @@ class Learner:
         policy: Any = None,
         schedule: schedules.Schedule | str | None = None,
         entries: Iterable[Entry] = (),
+        kept: Settings | None = None,
         **settings: Any,
     ):
         self.environment = rollouts.open_environment(env)
+        self.given = env if isinstance(env, gymnasium.Env) else as_given(self.environment)
         if "environment" in settings:
             raise ValueError("settings: expected env alone to say which environment, got environment too")
         own_policy = None if policy is None or isinstance(policy, str) else policy
-        self.settings: Settings = settings_for(
+        self.settings: Settings = kept or settings_for(
             env if isinstance(env, str) else environment_name(self.environment),
             policy=policy if own_policy is None else "other",
             features="drawn" if features is None else "other",

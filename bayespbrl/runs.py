@@ -1,6 +1,6 @@
 """A run that is kept on disk: start it, resume it, load it."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import xarray as xr
 
 from bayespbrl import rollouts
 from bayespbrl.cycle import Learner
-from bayespbrl.envs.opening import as_given, from_plain, to_plain
+from bayespbrl.envs.opening import from_plain, to_plain
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
 from bayespbrl.run_directory import RunDirectory, fresh_directory
@@ -79,34 +79,28 @@ def load(
 
 
 def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedule: Any) -> Learner:
-    settings = asdict(log.settings)
-    name, kind = settings.pop("env"), settings.pop("policy")
-    bounds = settings.pop("schedule")
+    settings = log.settings
     for part, own, given in (
-        ("features", settings.pop("features"), features),
-        ("policy", kind, policy),
-        ("schedule", bounds, schedule),
+        ("features", settings.features, features),
+        ("policy", settings.policy, policy),
+        ("schedule", settings.schedule, schedule),
     ):
         if (own == "other") != (given is not None):
             had, expected = ("with", "it again as") if own == "other" else ("without", "no")
             raise ValueError(f"{log.path}: a run {had} {part} of the user's own: expected {expected} {part}=")
-    if settings.pop("environment") == "other" and env is None:
+    if settings.environment == "other" and env is None:
         raise ValueError(f"{log.path}: a run with an environment of the user's own: expected it again as env=")
     try:
-        learner = Learner(
-            name if env is None else env,
+        return Learner(
+            settings.env if env is None else env,
             features=features,
-            policy=kind if policy is None else policy,
-            schedule=bounds if schedule is None else schedule,
+            policy=policy,
+            schedule=schedule,
             entries=log.entries(features=features, known=() if policy is None else (type(policy),)),
-            **settings,
+            kept=settings,
         )
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
-    named = {name: getattr(log.settings, name) for name in ("env", "environment")}  # another object may be passed
-    if replace(learner.settings, **named) != log.settings:
-        raise ValueError(f"{log.path}: expected settings that this version can give again, got {log.settings}")
-    return learner
 
 
 @dataclass(frozen=True)
@@ -128,8 +122,7 @@ class Run:
     @property
     def policy(self) -> Actor:
         """The last policy: `run.policy.act(observation)` is an action for the environment, as it was given."""
-        environment = self.learner.environment
-        given = as_given(environment)
+        environment, given = self.learner.environment, self.learner.given
         return Actor(
             self.learner.policy,
             environment.action_space,

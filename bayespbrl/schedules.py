@@ -116,7 +116,7 @@ def decided(schedule: Schedule, situation: Situation) -> Bound:
     """What `schedule` decides, checked.
 
     Raises:
-      ValueError: anything but a positive finite number, or statistics that are no plain numbers by name, naming the
+      ValueError: anything but a positive finite number, or statistics that a run cannot keep by name, naming the
         schedule.
     """
     bound = schedule(situation)
@@ -128,6 +128,13 @@ def decided(schedule: Schedule, situation: Situation) -> Bound:
     if not number or not math.isfinite(value) or value <= 0:
         raise ValueError(f"schedule {name}: expected a positive finite KL bound, got {value!r}")
     for key, figure in bound.statistics.items():
-        if not isinstance(key, str) or key == "reason" or not isinstance(figure, int | float | str | np.number):
+        if not isinstance(key, str) or key == "reason" or not _kept(figure):
             raise ValueError(f"schedule {name}: expected statistics that are numbers by name, got {key!r}: {figure!r}")
     return Bound(float(value), bound.reason, dict(bound.statistics))
+
+
+def _kept(figure: Any) -> bool:
+    """Whether a run can keep it: a number, a text, none, or a list of them."""
+    if isinstance(figure, list | tuple):
+        return all(map(_kept, figure))
+    return figure is None or isinstance(figure, int | float | str | np.number | np.bool_)

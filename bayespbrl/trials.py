@@ -231,7 +231,7 @@ def _in_parallel(seeds: _Seeds, jobs: int, progress: Callable[[int], None] | Non
 def _ending_at_once(pool: ProcessPoolExecutor, others: Sequence[BaseProcess]) -> Iterator[None]:
     """Where the study is interrupted its trials end too, as if killed: each goes on where it stopped when called again.
 
-    `others` are child processes that are not the pool's.
+    `others` are child processes that are not the pool's; those that began since are taken for it.
     """
     try:
         yield

@@ -19,6 +19,7 @@ import xarray as xr
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert, run_directory, runs
 from bayespbrl.diagnostics.report import write_report
+from bayespbrl.envs.opening import given_by_name, open_environment
 from bayespbrl.policies import TabularPolicy
 from bayespbrl.run_directory import RunDirectory
 from bayespbrl.settings import PRESETS
@@ -175,16 +176,19 @@ def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):
         observation, *_ = environment.step(policy.act(observation))
 
 
-def test_settings_that_would_come_back_as_others_are_refused(tmp_path):
+def test_settings_come_back_as_they_were_kept_whatever_the_preset_says_today(tmp_path):
     start(tmp_path / "run").ask()
-    file = tmp_path / "run" / "settings.json"
-    settings = json.loads(file.read_text())
-    settings["trajectory_discount"] = None  # as before the preset had one
-    file.write_text(json.dumps(settings))
-    refused = pytest.raises(ValueError, match="run: expected settings that this version can give again")
-    with mock.patch.dict(PRESETS["gridworld"], {"trajectory_discount": 1.0}), refused:
-        bayespbrl.load(tmp_path / "run")
-    assert bayespbrl.load(tmp_path / "run").settings.trajectory_discount is None
+    with mock.patch.dict(PRESETS["gridworld"], {"trajectory_discount": 1.0}):
+        assert bayespbrl.load(tmp_path / "run").settings.trajectory_discount is None
+        assert start(tmp_path / "new").settings.trajectory_discount == 1.0
+
+
+def test_an_environment_that_was_open_already_is_acted_in_as_it_is(tmp_path):
+    environment = open_environment(Odd(gymnasium.spaces.Discrete(2, start=1)))
+    bayespbrl.start(environment, tmp_path / "run", **(QUICK | {"iterations": 1, "centres": 5})).run(ReturnExpert())
+    policy = bayespbrl.load(tmp_path / "run", env=environment).policy
+    observation, _ = environment.reset(seed=0)
+    assert all(environment.action_space.contains(policy.act(observation)) for _ in range(8))
 
 
 def test_evaluation_is_a_function_of_the_seed(finished):
@@ -603,6 +607,17 @@ def test_an_environment_that_its_name_would_not_give_again_has_to_be_passed(tmp_
     assert "Pendulum-v1 was an object of the user's" in write_report(tmp_path / "run", format="md").read_text(
         encoding="utf-8"
     )
+
+
+def test_arguments_that_are_arrays_are_compared():
+    kwargs = {"goal": np.array([1.0, 2.0]), "render_mode": None}
+    gymnasium.register("Goal-v0", entry_point=lambda goal, render_mode: Corridor(), kwargs=kwargs, max_episode_steps=5)
+    try:
+        assert given_by_name(gymnasium.make("Goal-v0"))
+        assert not given_by_name(gymnasium.make("Goal-v0", goal=np.array([1.0, 3.0])))
+        assert not given_by_name(gymnasium.make("Goal-v0", goal=np.ones(3)))
+    finally:
+        del gymnasium.registry["Goal-v0"]
 
 
 def test_an_environment_as_its_name_makes_it_need_not_be_passed_again(tmp_path):

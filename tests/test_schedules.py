@@ -117,10 +117,15 @@ def test_a_schedule_that_decides_nonsense_is_named(value):
         decided(careless, situation(proposed()))
 
 
-@pytest.mark.parametrize("statistics", [{"gain": np.ones(2)}, {"gain": None}, {"reason": 1.0}, {1: 1.0}])
+@pytest.mark.parametrize("statistics", [{"gain": np.ones(2)}, {"gain": {"mean": 1.0}}, {"reason": 1.0}, {1: 1.0}])
 def test_statistics_that_could_not_be_kept_are_named(statistics):
     with pytest.raises(ValueError, match=r"schedule .*: expected statistics that are numbers by name, got"):
         decided(lambda situation: Bound(0.2, "mine", statistics), situation(proposed()))
+
+
+def test_statistics_may_be_flags_texts_and_lists():
+    statistics = {"sure": np.bool_(True), "why": "x", "gains": [1.0, np.float64(2.0)], "none": None}
+    assert decided(lambda situation: Bound(0.2, "mine", statistics), situation(proposed())).statistics == statistics
 
 
 @pytest.mark.parametrize("largest", [0.0, -1.0, float("nan"), float("inf")])

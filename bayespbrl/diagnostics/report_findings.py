@@ -57,9 +57,9 @@ def _reached(evidence: Evidence, iterations: xr.Dataset) -> str:
     if optimum is not None:
         text += f", {percent(value[-1] / optimum, 1)} of the optimum {figure(optimum)}"
     best = int(np.argmax(value))
-    when = f"after {count(int(np.nan_to_num(answers[best])), 'answer')}" + (
-        f" and {count(best + 1, 'iteration')}" if unasked else ""
-    )
+    known = not np.isnan(answers[best])
+    when = f"after {count(int(answers[best]), 'answer')}" if known else f"in iteration {best + 1}"
+    when += f" and {count(best + 1, 'iteration')}" if known and unasked else ""
     text += f". After the first iteration it was {figure(value[0])}; "
     if best == len(value) - 1:
         return f"{text}it has never been better."

@@ -66,9 +66,20 @@ def given_by_name(environment: Any) -> bool:
     spec = environment if isinstance(environment, EnvSpec) else getattr(environment, "spec", None)
     if spec is None or (registered := gymnasium.registry.get(spec.id)) is None:
         return False
-    kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
-    limit = spec.max_episode_steps == registered.max_episode_steps
-    return limit and not spec.additional_wrappers and kwargs == registered.kwargs
+    named = [
+        {name: value for name, value in one.kwargs.items() if name != "render_mode"}
+        | {"max_episode_steps": one.max_episode_steps, "additional_wrappers": one.additional_wrappers}
+        for one in (spec, registered)
+    ]
+    return named[0].keys() == named[1].keys() and all(_same(named[0][name], named[1][name]) for name in named[0])
+
+
+def _same(first: Any, second: Any) -> bool:
+    """Whether two arguments are equal, arrays too; not so where that cannot be told."""
+    try:
+        return bool(np.array_equal(first, second) if isinstance(first, np.ndarray) else first == second)
+    except ValueError:
+        return False
 
 
 def told(env: gymnasium.Env, name: str) -> Any:

@@ -22,10 +22,10 @@ from bayespbrl.models.likelihoods import ProbitMixture
 # far below: 1e5 with 320 random answers about nearly the same margins.
 RUNAWAY = 1e12
 SAME = 1e-10  # of the cosine between two rows of L, below 1, where they are about the same margin
-# Panels on which one factor of several answers is integrated: they shrink towards the steps, and go on to where the
-# Gaussian ends, in its standard deviations.
-SHRINKING, WIDE = np.geomspace(1e-7, 1, 60), np.linspace(-12, 12, 97)
-NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(12)
+# Panels on which one factor of several answers is integrated: to where the Gaussian ends, in its standard deviations,
+# and narrower ones towards the offsets.
+WIDE, GROWTH = np.linspace(-12, 12, 49), 1.5
+NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 
 @dataclass(frozen=True)
@@ -82,21 +82,24 @@ def repeated_moments(
 
     `mixture` has a constant and a row of weights for each of the n.
     """
-    deviation = np.sqrt(variance)
-    steps = np.unique(np.append(mixture.offsets / ratios[:, None], 0.0))
-    near = SHRINKING * (np.max(np.abs(steps)) + abs(mean) + 12 * deviation)
-    edges = np.unique(
-        np.concatenate([(steps[:, None] + np.append(-near, near)).ravel(), steps, mean + deviation * WIDE])
-    )
+    deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+    offsets = np.unique(mixture.offsets / ratios[:, None])
+    span = np.max(np.abs(offsets)) + abs(mean) + 12 * deviation
+    smooth = mixture.scales[mixture.scales > 0]  # a step ends a panel, and needs no narrow ones
+    narrowest = 0.2 * np.min(smooth) / np.max(np.abs(ratios)) if len(smooth) else span
+    near = span / GROWTH ** np.arange(max(1, int(np.log(span / narrowest) / np.log(GROWTH)) + 1))
+    around = np.concatenate([-near, [0.0], near])
+    edges = np.unique(np.concatenate([(offsets[:, None] + around).ravel(), mean + deviation * WIDE]))
     edges = edges[np.abs(edges - mean) <= 12 * deviation]
     halves = np.diff(edges)[:, None] / 2
     t, widths = ((edges[:-1, None] + halves) + halves * NODES).ravel(), (halves * NODE_WEIGHTS).ravel()
-    log_density = -0.5 * (t - mean) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)
-    for ratio, constant, weights in zip(ratios, np.asarray(mixture.constant), mixture.weights, strict=True):
+    log_density = -0.5 * ((t - mean) / deviation) ** 2 - 0.5 * np.log(2 * np.pi) - np.log(deviation)
+    kinds = np.column_stack([ratios, mixture.constant, mixture.weights])
+    for (ratio, constant, *weights), count in zip(*np.unique(kinds, axis=0, return_counts=True), strict=True):
         distance = ratio * t[:, None] - mixture.offsets
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             cdf = np.where(mixture.scales > 0, ndtr(distance / mixture.scales), distance > 0)
-        log_density += np.log(np.maximum(constant + cdf @ weights, np.finfo(float).tiny))
+        log_density += count * np.log(np.maximum(constant + cdf @ weights, np.finfo(float).tiny))
     top = log_density.max()
     density = np.exp(log_density - top) * widths
     z = density.sum()
@@ -104,16 +107,22 @@ def repeated_moments(
     return float(top + np.log(z)), float(tilted), float(density @ (t - tilted) ** 2 / z)
 
 
-def _same_margins(loadings: np.ndarray) -> list[np.ndarray]:
-    """The rows of L in groups that are parallel, in the order of the first of each."""
-    gram = loadings @ loadings.T
-    lengths = np.sqrt(np.diag(gram))
-    parallel = np.abs(gram) >= (1 - SAME) * np.outer(lengths, lengths)
+def _same_margins(loadings: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The rows of L in groups that are parallel, in the order of the first of each, and their ratios to it."""
+    tiny = np.finfo(float).tiny
+    largest = np.maximum(np.max(np.abs(loadings), axis=1, initial=0.0, keepdims=True), tiny)
+    units = loadings / largest  # entries near the smallest numbers have no squares
+    lengths = np.maximum(np.linalg.norm(units, axis=1, keepdims=True), tiny)
+    units, lengths = units / lengths, (lengths * largest)[:, 0]
+    cosines = units @ units.T
     groups, free = [], np.ones(len(loadings), dtype=bool)
     for row in range(len(loadings)):
         if free[row]:
-            groups.append(np.flatnonzero(parallel[row] & free))
-            free[groups[-1]] = False
+            alike = free & (np.abs(cosines[row]) >= 1 - SAME)
+            alike[row] = True
+            group = np.flatnonzero(alike)
+            groups.append((group, np.sign(cosines[row, group]) * lengths[group] / lengths[row]))
+            free[group] = False
     return groups
 
 
@@ -122,7 +131,8 @@ class _Factors:
 
     def __init__(self, loadings: np.ndarray, mixture: ProbitMixture):
         groups = _same_margins(loadings)
-        self.first = np.array([group[0] for group in groups], dtype=int)
+        self.first = np.array([group[0] for group, _ in groups], dtype=int)
+        self.single = np.array([len(group) == 1 for group, _ in groups], dtype=bool)
         rows = ProbitMixture(
             np.broadcast_to(mixture.constant, len(loadings)),
             np.broadcast_to(mixture.weights, (len(loadings), len(mixture.offsets))),
@@ -131,9 +141,7 @@ class _Factors:
         )
         self.mixture = mixture if np.ndim(mixture.weights) == 1 else _rows(rows, self.first)
         self.repeated = [
-            (number, loadings[group] @ loadings[group[0]] / np.sum(loadings[group[0]] ** 2), _rows(rows, group))
-            for number, group in enumerate(groups)
-            if len(group) > 1
+            (number, ratios, _rows(rows, group)) for number, (group, ratios) in enumerate(groups) if len(group) > 1
         ]
 
     def moments(self, means: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -186,7 +194,7 @@ def expectation_propagation(
         # a violated answer's factor can widen its margin: its precision is held at 0, its shift keeps the tilted mean
         new_precisions = np.maximum(1 / variance - 1 / cavity_variance, 0.0)
         new_shifts = mean * (new_precisions + 1 / cavity_variance) - cavity_mean / cavity_variance
-        narrowed = new_precisions * prior[3]
+        narrowed = np.where(factors.single, new_precisions * prior[3], 0.0)  # one factor of several cannot run
         if np.any(narrowed[~held] > RUNAWAY):
             held |= narrowed > 0.01 * RUNAWAY
             precisions, shifts, gaussian = np.zeros(number), np.zeros(number), prior
