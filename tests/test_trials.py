@@ -218,8 +218,11 @@ def test_bad_input_is_named_and_nothing_is_left(tmp_path, changes):
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["killed", "interrupted"])
 def test_a_study_that_is_stopped_takes_its_trials_with_it(tmp_path, how):
-    command = [sys.executable, "-m", "bayespbrl", "trials", "gridworld", "--utility", "linear-program"]
-    options = ["--iterations", "100000", "--trials", "3", "--jobs", "2", "--out", str(tmp_path / "study")]
+    # where the tests run in the background interrupts are ignored, and would be here
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{heard}; from bayespbrl.cli import main; main()", "trials", "gridworld"]
+    options = ["--utility", "linear-program", "--iterations", "100000", "--trials", "3", "--jobs", "2"]
+    options += ["--out", str(tmp_path / "study")]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([*command, *options], **streams, start_new_session=True) as study:
         try:
