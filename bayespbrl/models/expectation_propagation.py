@@ -8,7 +8,6 @@ are found by quadrature. Gaussians of their own would each be fitted to what the
 and four against a margin those of the four alone may be left.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,7 +79,7 @@ def repeated_moments(
 ) -> tuple[float, float, float]:
     """log Z, mean and variance of N(t; mean, variance) Πₖ pₖ(ratiosₖ t) / Z by quadrature: n answers about one margin.
 
-    `mixture` has a constant and a row of weights for each of the n.
+    `mixture` is of the n answers.
     """
     deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
     offsets = np.unique(mixture.offsets / ratios[:, None])
@@ -94,7 +93,9 @@ def repeated_moments(
     halves = np.diff(edges)[:, None] / 2
     t, widths = ((edges[:-1, None] + halves) + halves * NODES).ravel(), (halves * NODE_WEIGHTS).ravel()
     log_density = -0.5 * ((t - mean) / deviation) ** 2 - 0.5 * np.log(2 * np.pi) - np.log(deviation)
-    kinds = np.column_stack([ratios, mixture.constant, mixture.weights])
+    constants = np.broadcast_to(mixture.constant, ratios.shape)
+    rows = np.broadcast_to(mixture.weights, (len(ratios), len(mixture.scales)))
+    kinds = np.column_stack([ratios, constants, rows])
     for (ratio, constant, *weights), count in zip(*np.unique(kinds, axis=0, return_counts=True), strict=True):
         distance = ratio * t[:, None] - mixture.offsets
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -133,15 +134,9 @@ class _Factors:
         groups = _same_margins(loadings)
         self.first = np.array([group[0] for group, _ in groups], dtype=int)
         self.single = np.array([len(group) == 1 for group, _ in groups], dtype=bool)
-        rows = ProbitMixture(
-            np.broadcast_to(mixture.constant, len(loadings)),
-            np.broadcast_to(mixture.weights, (len(loadings), len(mixture.offsets))),
-            mixture.offsets,
-            mixture.scales,
-        )
-        self.mixture = mixture if np.ndim(mixture.weights) == 1 else _rows(rows, self.first)
+        self.mixture = mixture.of(self.first)
         self.repeated = [
-            (number, ratios, _rows(rows, group)) for number, (group, ratios) in enumerate(groups) if len(group) > 1
+            (number, ratios, mixture.of(group)) for number, (group, ratios) in enumerate(groups) if len(group) > 1
         ]
 
     def moments(self, means: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,10 +147,6 @@ class _Factors:
                 means[number], variances[number], ratios, mixture
             )
         return log_z, tilted, narrowed
-
-
-def _rows(mixture: ProbitMixture, rows: Sequence[int] | np.ndarray) -> ProbitMixture:
-    return mixture._replace(constant=np.asarray(mixture.constant)[rows], weights=mixture.weights[rows])
 
 
 def expectation_propagation(

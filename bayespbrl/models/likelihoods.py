@@ -25,6 +25,12 @@ class ProbitMixture(NamedTuple):
     offsets: np.ndarray
     scales: np.ndarray
 
+    def of(self, rows: np.ndarray) -> "ProbitMixture":
+        """That of some of the answers; the same where all are of one kind."""
+        if np.ndim(self.weights) == 1:
+            return self
+        return self._replace(constant=np.asarray(self.constant)[rows], weights=self.weights[rows])
+
 
 @runtime_checkable
 class Likelihood(Protocol):

@@ -169,9 +169,7 @@ def fit_gaussian(differences: np.ndarray, *, prior_scale: float, likelihood: Lik
 def _fit_gaussian(differences: np.ndarray, prior_scale: float, likelihood: Likelihood) -> GaussianFit:
     factors = low_rank(differences)
     used = used_rows(factors.loadings)
-    mixture = likelihood.probit_mixture()
-    if np.ndim(mixture.weights) == 2:
-        mixture = mixture._replace(constant=np.asarray(mixture.constant)[used], weights=mixture.weights[used])
+    mixture = likelihood.probit_mixture().of(used)
     approximation = expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale)
     log_evidence = approximation.log_evidence
     if not np.all(used):  # rows of zeros have a factor of their own; else nothing is compiled for a new K
