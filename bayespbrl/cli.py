@@ -142,7 +142,7 @@ def trials(
 
     utility = options.get("utility") or "posterior-mean"
     directory = out or Path("runs") / f"trials-{env.replace('/', '-').lower()}-{utility}"
-    with progress_bar("{task.fields[state]}") as bar:
+    with progress_bar() as bar:
         task = bar.add_task("trials", total=number, state=f"{directory}")
         try:
             study = run_trials(

@@ -46,7 +46,7 @@ def _film(learner: Any, directory: Path) -> str:
 def _run_with_bar(learner: Any) -> None:
     from bayespbrl.experts import simulated_expert
 
-    with progress_bar("{task.fields[state]}") as bar:
+    with progress_bar() as bar:
         total, done = learner.settings.iterations, learner.state.iteration
         task = bar.add_task("iterations", total=total, completed=done, state=_state(learner))
         learner.run(
@@ -56,10 +56,12 @@ def _run_with_bar(learner: Any) -> None:
         bar.update(task, completed=learner.state.iteration, state=_state(learner))
 
 
-def progress_bar(state: str) -> Progress:
-    """Of so many done of so many, with `state`, a template of the task's fields, behind it."""
+def progress_bar() -> Progress:
+    """Of so many done of so many, with the task's field `state` behind it."""
     done = TextColumn("{task.description} {task.completed}/{task.total}")
-    return Progress(done, BarColumn(), TimeElapsedColumn(), TextColumn(state, markup=False), console=console)
+    return Progress(
+        done, BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[state]}", markup=False), console=console
+    )
 
 
 def _state(learner: Any) -> str:

@@ -203,16 +203,17 @@ def _in_parallel(seeds: _Seeds, jobs: int, progress: Callable[[int], None] | Non
         ) as pool,
         _ending_at_once(pool, before),
     ):
-        seeds.to_do()
-        if progress is not None:
-            for seed in seeds.with_outcome(True):
-                progress(seed)
         started: set[int] = set()
+        told: set[int] = set()
         while True:
             for seed in seeds.to_do():
                 if seed not in started:
                     started.add(seed)
                     running[pool.submit(_trial, seeds.study, seed)] = seed
+            for seed in seeds.with_outcome(True):
+                if progress is not None and seed not in told:
+                    progress(seed)
+                told.add(seed)
             if not running:
                 break
             for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -221,8 +222,6 @@ def _in_parallel(seeds: _Seeds, jobs: int, progress: Callable[[int], None] | Non
                     failures.append(f"seed {seed}: {error}")
                     continue
                 seeds.outcomes[seed] = future.result()
-                if seeds.outcomes[seed] and progress is not None:
-                    progress(seed)
     if failures:
         raise ValueError(f"{len(failures)} of {seeds.trials} trials failed; the first: {failures[0]}")
 
