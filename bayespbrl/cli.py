@@ -53,8 +53,8 @@ class RunOptions(TypedDict, total=False):
     unasked_iterations: Annotated[
         int | None,
         typer.Option(
-            help="Iterations in a row, at most, that ask nothing: with the schedule confidence while it is sure, with "
-            "constant always; 0 is the paper's."
+            help="Iterations in a row, at most, that ask nothing, and no more than half the answers so far: with the "
+            "schedule confidence while it is sure, with constant always; 0 is the paper's."
         ),
     ]
     likelihood: Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or probit.")]

@@ -230,7 +230,10 @@ class Learner:
         Where the schedule records no signal there is nothing to go by, and the setting alone decides.
         """
         state, last = self.state, self.state.summaries[-1]
-        if state.unasked >= self.settings.unasked_iterations or not state.preferences.pairs:
+        # Decision: no more in a row than half the answers. What two or three of them say holds for a step or two; a
+        # policy that goes on by it narrows on what is wrong (RESULTS.md, "Asking less").
+        most = min(self.settings.unasked_iterations, state.preferences.answers // 2)
+        if state.unasked >= most or not state.preferences.pairs:
             return False
         if "signal" not in last["schedule"]:
             return True
