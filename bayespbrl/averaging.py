@@ -34,8 +34,8 @@ class AveragedUtility(LinearUtility):
     """A mixture over settings, round the one that the evidence speaks for most.
 
     What the learner acts on is the mixture's: `utilities`, `step_utilities`, `trajectory_utilities`, `state_draws`,
-    `trajectory_draws` and `utilities_and_draws`. All else is of that one setting, whose posterior was sampled and can
-    be diagnosed.
+    `trajectory_draws`, `margin_draws` and `utilities_and_draws`. All else is of that one setting, whose posterior was
+    sampled and can be diagnosed.
 
     Attributes:
       base: φ as given.
@@ -65,6 +65,11 @@ class AveragedUtility(LinearUtility):
 
     def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
         return self._mixed(self._of_trajectories(trajectories), self._spaced(number))[1]
+
+    def margin_draws(self, one: Trajectory, other: Trajectory) -> np.ndarray:
+        """How much higher each draw puts `one`, shape (S,)."""
+        draws = self.trajectory_draws([one, other])
+        return draws[:, 0] - draws[:, 1]
 
     def utilities_and_draws(self, states: np.ndarray, *, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         return self._mixed(_of_states(states), self._spaced(number))

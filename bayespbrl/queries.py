@@ -6,11 +6,10 @@ of preference: the first is asked about, the next when that question is skipped,
 
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 from scipy.special import entr
 
-from bayespbrl.models.likelihoods import Likelihood, log_prob
+from bayespbrl.models.likelihoods import Likelihood, answer_probabilities
 from bayespbrl.preferences import Query
 from bayespbrl.trajectories import Trajectory
 
@@ -108,13 +107,9 @@ def expected_information(utilities: np.ndarray, incumbent: np.ndarray, *, likeli
     learning", eq. 2.
     """
     utilities, incumbent = _checked(utilities, incumbent)
-    with jax.enable_x64(True):
-        p = np.exp(np.asarray(_log_prob(likelihood, utilities - incumbent[:, None])))
+    p = answer_probabilities(likelihood, utilities - incumbent[:, None])
     # the estimate from the same draws is never negative but for rounding
     return np.maximum(_entropy(p.mean(axis=0)) - _entropy(p).mean(axis=0), 0.0)
-
-
-_log_prob = jax.jit(log_prob)
 
 
 def _entropy(p: np.ndarray) -> np.ndarray:

@@ -34,7 +34,8 @@ def start(
     Args:
       env: as of `Learner`.
       directory: must not exist; a fresh one under `runs/` when None.
-      features, policy, schedule, **settings: as of `Learner`.
+      features, policy, schedule, **settings: as of `Learner`. `expert="other"` says that neither the simulated expert
+        nor a person at a terminal answers, so that `bayespbrl resume` does not let one of them go on.
 
     Raises:
       ValueError: bad options, or a directory that exists; nothing is left behind then.

@@ -46,6 +46,7 @@ def _film(learner: Any, directory: Path) -> str:
 def _run_with_bar(learner: Any) -> None:
     from bayespbrl.experts import simulated_expert
 
+    console.print("The simulated expert answers, by the hidden reward.")
     with progress_bar() as bar:
         total, done = learner.settings.iterations, learner.state.iteration
         task = bar.add_task("iterations", total=total, completed=done, state=_state(learner))

@@ -67,9 +67,9 @@ class Settings:
         0.75 or more; with less it asks for the most information about any trajectory that was never compared.
       trajectories_per_iteration: N.
       queries_per_iteration, first_queries: M, in later iterations and in the first.
-      unasked_iterations: so many iterations in a row, at most, and no more than half the answers so far, ask nothing,
-        once there is a preference: with the schedule `confidence` while the posterior has converged and the signal is
-        0.5 or more; with one that has no signal, as `constant`, always. 0 is the paper's.
+      unasked_iterations: so many iterations in a row, at most, and no more than half the answers so far (ties among
+        them), ask nothing, once there is a preference: with the schedule `confidence` while the posterior has converged
+        and the signal is 0.5 or more; with one that has no signal, as `constant`, always. 0 is the paper's.
       discount: γ.
       trajectory_discount: γ of ψ(τ) in the preferences; None for `discount`, as in the paper; 1 for an expert who
         judges whole trajectories, whose answers less would explain by how the trajectories begin.

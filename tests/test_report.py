@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import gymnasium
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -18,15 +19,18 @@ from matplotlib.figure import Figure
 import bayespbrl
 from bayespbrl import ReturnExpert
 from bayespbrl.cli import main
-from bayespbrl.diagnostics import report_document, report_figures, report_tables
+from bayespbrl.diagnostics import report_document, report_figures, report_tables, report_warnings
 from bayespbrl.diagnostics.predictions import answer_probabilities
+from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report import assembled, write_report
 from bayespbrl.diagnostics.report_answers import surprise_order
 from bayespbrl.diagnostics.report_evidence import read_evidence
 from bayespbrl.diagnostics.report_findings import figure
 from bayespbrl.iteration_files import read_iteration
+from bayespbrl.models.likelihoods import log_prob
 from bayespbrl.schedules import Bound
 from bayespbrl.trajectories import trajectory_features
+from bayespbrl.utility import LinearUtility
 
 QUICK = {"iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
 
@@ -175,6 +179,38 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(f
     utilities = run.estimate.trajectory_utilities(both)
     margin = (utilities[0] - utilities[1]) * (1 if said == "first" else -1)
     assert float(table["margin"][3]) == pytest.approx(margin, rel=1e-6)  # in the units of the utility
+
+
+def test_of_an_averaged_utility_the_answers_have_the_probabilities_of_the_average(tmp_path):
+    options = {"iterations": 4, "max_steps": 20, "evaluation_episodes": 3, "centres": 30, "seed": 3}
+    run = bayespbrl.start("swing-up", tmp_path / "run", hyperparameters="averaged", **options).run(ReturnExpert())
+    evidence = read_evidence(tmp_path / "run")
+    table = report_tables.answers_table(evidence)
+    of_one_setting = []
+    for k, record in list(enumerate(evidence.answers))[2:]:
+        before = read_iteration(tmp_path / "run" / "iterations" / f"{record.iteration - 1:04d}.nc", "improved")[
+            "estimate"
+        ]
+        numbers = (record.first, record.second)[:: 1 if str(record.answer) == "first" else -1]
+        both = [run.trajectories[number] for number in numbers]
+        for name, estimate in (("before", before), ("probability", run.estimate)):
+            margins = -np.diff(estimate.trajectory_draws(both))[:, 0]
+            expected = np.exp(log_prob(estimate.likelihood, jnp.asarray(margins))).mean()
+            assert float(table[name][k]) == pytest.approx(float(expected), abs=1e-4)
+        assert float(table["margin"][k]) == pytest.approx(margins.mean(), rel=1e-6)
+        assert float(table["margin_sd"][k]) == pytest.approx(margins.std(), rel=1e-6)
+        of_one_setting.append(float(np.mean(np.diff(LinearUtility.trajectory_draws(before, both)) < 0)))
+    assert np.abs(table["before"].values[2:] - of_one_setting).max() > 0.03  # or this could not tell them apart
+    assert "it gives the answers their probabilities" in read(write_report(tmp_path / "run")).text
+
+
+def test_few_predictions_are_no_ground_for_a_warning(finished):
+    evidence = read_evidence(finished)
+    tables = report_tables.iterations_table(evidence.iterations), report_tables.answers_table(evidence)
+    for number, warned in ((9, False), (10, True)):
+        scores = score_predictions(np.full(number, 0.999), np.zeros(number, dtype=bool))  # sure, and wrong
+        found = [caution.what for caution in report_warnings.warnings(evidence, *tables, scores)]
+        assert any("surer than they should have been" in what for what in found) == warned
 
 
 def test_the_most_surprising_answer_comes_first_and_ties_last():

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from bayespbrl.averaging import AveragedUtility
 from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
 from bayespbrl.diagnostics.report_log import AnswerRecord, read_log
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.features import checked_features
 from bayespbrl.iteration_files import read_parts
+from bayespbrl.models import likelihoods
 from bayespbrl.preferences import Preferences
 from bayespbrl.run_directory import RunDirectory
 from bayespbrl.settings import WITHOUT_POSTERIOR, Settings
@@ -165,6 +167,9 @@ class _Reader:
             probability = 0.5  # before any answer, the prior says nothing of which is better
         elif getattr(self.estimate, "posterior", None) is None or self.features_missing:
             return record
+        elif isinstance(self.estimate, AveragedUtility):
+            margins = self.estimate.margin_draws(*both)
+            probability = float(likelihoods.answer_probabilities(self.estimate.likelihood, margins).mean())
         else:
             sums = trajectory_features(both, self.estimate.features, discount=self.estimate.discount)
             difference = (sums[[0]] - sums[[1]]) / self.estimate.scale

@@ -8,6 +8,8 @@ import xarray as xr
 from bayespbrl.diagnostics.report_evidence import Evidence
 from bayespbrl.settings import WITHOUT_POSTERIOR
 
+ENOUGH_PREDICTIONS = 10  # to judge calibration by
+
 
 def learnt(
     evidence: Evidence, iterations: xr.Dataset, answers: xr.Dataset, scores: xr.Dataset, ranking: xr.Dataset
@@ -131,8 +133,8 @@ def _sureness(evidence: Evidence, ranking: xr.Dataset) -> list[str]:
     better = ranking["better_probability"].values[np.triu_indices(number, k=1)]
     sure = float(np.mean(np.maximum(better, 1 - better)))
     sentences = [
-        f"Taking two of the newest {number} trajectories at a time, it is {percent(sure)} sure, on average, "
-        "which of them is better (50 % is knowing nothing)."
+        f"Taking two at a time of {number} trajectories, the newest and the undominated one, it is {percent(sure)} "
+        "sure, on average, which of them is better (50 % is knowing nothing)."
     ]
     for best in set(evidence.preferences.undominated[-1:]) & set(ranking["trajectory"].values.tolist()):
         wins = percent(float(ranking["best_probability"].sel(trajectory=best)))
@@ -143,7 +145,7 @@ def _sureness(evidence: Evidence, ranking: xr.Dataset) -> list[str]:
 def _calibrated(scores: xr.Dataset) -> str:
     score, expected, sd = (float(scores[name]) for name in ("log_score", "log_score_expected", "log_score_sd"))
     text = f"The log score is {figure(score)} nats, where {figure(expected)} ± {figure(sd)} was to be expected: "
-    if scores.sizes["prediction"] < 10:
+    if scores.sizes["prediction"] < ENOUGH_PREDICTIONS:
         return text + "too few to judge by."
     if score < expected - 2 * sd:
         return text + "it was surer than it should have been."

@@ -7,10 +7,14 @@ import numpy as np
 import xarray as xr
 from gymnasium.spaces import Discrete
 
+from bayespbrl.averaging import AveragedUtility
 from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report_evidence import Evidence
+from bayespbrl.diagnostics.report_log import AnswerRecord
 from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws
+from bayespbrl.models.likelihoods import answer_probabilities
 from bayespbrl.preferences import Answer
+from bayespbrl.trajectories import Trajectory
 
 MEASURED = (
     "answers",
@@ -75,7 +79,12 @@ def answers_table(evidence: Evidence) -> xr.Dataset:
         columns["before"][k] = record.predicted if record.answer is Answer.FIRST else 1 - record.predicted
         if record.row >= known:
             continue
-        if tree is not None:
+        if isinstance(evidence.estimate, AveragedUtility):
+            if (both := _preferred_and_dominated(evidence, record)) is not None:
+                margins = evidence.estimate.margin_draws(*both)
+                columns["probability"][k] = np.mean(answer_probabilities(evidence.estimate.likelihood, margins))
+                columns["margin"][k], columns["margin_sd"][k] = margins.mean(), margins.std()
+        elif tree is not None:
             margins = np.asarray(tree["posterior"]["margins"])[:, :, record.row]
             log_likelihood = np.asarray(tree["log_likelihood"]["answers"])[:, :, record.row]
             columns["probability"][k] = np.mean(np.exp(log_likelihood))
@@ -203,14 +212,20 @@ def _observed(evidence: Evidence) -> np.ndarray:
     return np.concatenate([trajectory.states for trajectory in evidence.trajectories.values()])
 
 
-def _margin(evidence: Evidence, record: Any) -> float:
+def _margin(evidence: Evidence, record: AnswerRecord) -> float:
     """By an estimate without draws, in its own units; NaN where a trajectory or its features are missing."""
-    numbers = (record.first, record.second) if record.answer is Answer.FIRST else (record.second, record.first)
-    both = [evidence.trajectories.get(number) for number in numbers]
-    if None in both or evidence.features_missing:
+    both = _preferred_and_dominated(evidence, record)
+    if both is None:
         return float("nan")
     preferred, dominated = evidence.estimate.trajectory_utilities(both)
     return float(preferred - dominated)
+
+
+def _preferred_and_dominated(evidence: Evidence, record: AnswerRecord) -> list[Trajectory] | None:
+    """The two that an answer was about; None where one, or what their utility rests on, is missing."""
+    numbers = (record.first, record.second) if record.answer is Answer.FIRST else (record.second, record.first)
+    both = [evidence.trajectories[number] for number in numbers if number in evidence.trajectories]
+    return None if len(both) < 2 or evidence.features_missing else both
 
 
 def _number(value: Any) -> float:

@@ -28,9 +28,9 @@ def utility(evidence: Evidence, ranking: xr.Dataset) -> Section:
         likeliest = percent(evidence.estimate.probabilities.max())
         text.append(
             f"The learner acted on an average over {len(evidence.estimate.probabilities)} choices of length scales, "
-            f"the likeliest of probability {likeliest}. The trajectories below are ordered by that average; mean, "
-            "deviation and draws over the states, and all that is said of convergence, are of the one setting whose "
-            "posterior was sampled."
+            f"the likeliest of probability {likeliest}. The trajectories below are ordered by that average, and it "
+            "gives the answers their probabilities; mean, deviation and draws over the states, and all that is said of "
+            "convergence, influence and sensitivity, are of the one setting whose posterior was sampled."
         )
     if hasattr(evidence.estimate, "utilities"):
         table = utility_table(evidence)
@@ -46,9 +46,11 @@ def utility(evidence: Evidence, ranking: xr.Dataset) -> Section:
     compared = trajectories_table(evidence)
     if compared.sizes["trajectory"] and np.ptp(compared["hidden_return"].values) > 0:
         caption = (
-            "Every trajectory that was asked about. The interval is the posterior's for the utility of the whole; a "
-            "rising cloud says that the utility orders trajectories as the hidden return does. The scale is free."
+            "Every trajectory that was asked about. A rising cloud says that the utility orders trajectories as the "
+            "hidden return does. The scale is free."
         )
+        if "lower" in compared:
+            caption += " The interval is the posterior's for the utility of the whole."
         panels = [("Trajectories", partial(figures.plot_trajectories, compared))]
         alt = f"Inferred utility against hidden return of {compared.sizes['trajectory']} trajectories."
         blocks.append(drawn("trajectories", panels, caption, alt, columns=1, size=(6.0, 3.3)))

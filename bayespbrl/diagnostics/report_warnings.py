@@ -8,7 +8,7 @@ import xarray as xr
 from gymnasium.spaces import Discrete
 
 from bayespbrl.diagnostics.report_evidence import Evidence
-from bayespbrl.diagnostics.report_findings import count, figure
+from bayespbrl.diagnostics.report_findings import ENOUGH_PREDICTIONS, count, figure
 from bayespbrl.preferences import Answer
 
 # Below a tenth of what a uniform choice, or the first policy, has left there is nothing more to explore with; a
@@ -156,7 +156,7 @@ def _of_answers(evidence: Evidence, answers: xr.Dataset, scores: xr.Dataset) -> 
                 "were slips, or taught something.",
             )
         )
-    if scores.sizes["prediction"] and float(scores["log_score"]) < float(
+    if scores.sizes["prediction"] >= ENOUGH_PREDICTIONS and float(scores["log_score"]) < float(
         scores["log_score_expected"] - 2 * scores["log_score_sd"]
     ):
         found.append(

@@ -54,6 +54,15 @@ def log_prob(likelihood: Likelihood, margins: jax.Array) -> jax.Array:
     return exponent + jnp.log(ratio)
 
 
+def answer_probabilities(likelihood: Likelihood, margins: np.ndarray) -> np.ndarray:
+    """p(answer | t), elementwise, in float64."""
+    with jax.enable_x64(True):
+        return np.exp(np.asarray(_log_prob(likelihood, margins)))
+
+
+_log_prob = jax.jit(log_prob)
+
+
 def total_log_prob(likelihood: Likelihood, margins: jax.Array, used: jax.Array | None = None) -> jax.Array:
     """Σ log p over the answers where `used`, all when None; margins of shape (..., K).
 
