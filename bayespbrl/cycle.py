@@ -231,7 +231,7 @@ class Learner:
         """
         state, last = self.state, self.state.summaries[-1]
         # Decision: no more in a row than half the answers. What two or three of them say holds for a step or two; a
-        # policy that goes on by it narrows on what is wrong (RESULTS.md, "Asking less").
+        # policy that goes on by it narrows on what is wrong (RESULTS.md, "Asking little").
         most = min(self.settings.unasked_iterations, state.preferences.answers // 2)
         if state.unasked >= most or not state.preferences.pairs:
             return False

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import entr
 
-from bayespbrl.models.likelihoods import Likelihood, answer_probabilities
+from bayespbrl.models.likelihoods import Likelihood, prob
 from bayespbrl.preferences import Query
 from bayespbrl.trajectories import Trajectory
 
@@ -107,7 +107,7 @@ def expected_information(utilities: np.ndarray, incumbent: np.ndarray, *, likeli
     learning", eq. 2.
     """
     utilities, incumbent = _checked(utilities, incumbent)
-    p = answer_probabilities(likelihood, utilities - incumbent[:, None])
+    p = prob(likelihood, utilities - incumbent[:, None])
     # the estimate from the same draws is never negative but for rounding
     return np.maximum(_entropy(p.mean(axis=0)) - _entropy(p).mean(axis=0), 0.0)
 

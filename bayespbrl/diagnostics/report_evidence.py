@@ -18,7 +18,7 @@ from bayespbrl.diagnostics.report_log import AnswerRecord, read_log
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.features import checked_features
 from bayespbrl.iteration_files import read_parts
-from bayespbrl.models import likelihoods
+from bayespbrl.models.likelihoods import prob
 from bayespbrl.preferences import Preferences
 from bayespbrl.run_directory import RunDirectory
 from bayespbrl.settings import WITHOUT_POSTERIOR, Settings
@@ -169,7 +169,7 @@ class _Reader:
             return record
         elif isinstance(self.estimate, AveragedUtility):
             margins = self.estimate.margin_draws(*both)
-            probability = float(likelihoods.answer_probabilities(self.estimate.likelihood, margins).mean())
+            probability = float(prob(self.estimate.likelihood, margins).mean())
         else:
             sums = trajectory_features(both, self.estimate.features, discount=self.estimate.discount)
             difference = (sums[[0]] - sums[[1]]) / self.estimate.scale

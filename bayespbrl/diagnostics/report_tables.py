@@ -12,7 +12,7 @@ from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report_evidence import Evidence
 from bayespbrl.diagnostics.report_log import AnswerRecord
 from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws
-from bayespbrl.models.likelihoods import answer_probabilities
+from bayespbrl.models.likelihoods import prob
 from bayespbrl.preferences import Answer
 from bayespbrl.trajectories import Trajectory
 
@@ -82,7 +82,7 @@ def answers_table(evidence: Evidence) -> xr.Dataset:
         if isinstance(evidence.estimate, AveragedUtility):
             if (both := _preferred_and_dominated(evidence, record)) is not None:
                 margins = evidence.estimate.margin_draws(*both)
-                columns["probability"][k] = np.mean(answer_probabilities(evidence.estimate.likelihood, margins))
+                columns["probability"][k] = np.mean(prob(evidence.estimate.likelihood, margins))
                 columns["margin"][k], columns["margin_sd"][k] = margins.mean(), margins.std()
         elif tree is not None:
             margins = np.asarray(tree["posterior"]["margins"])[:, :, record.row]

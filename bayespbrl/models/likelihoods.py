@@ -54,7 +54,7 @@ def log_prob(likelihood: Likelihood, margins: jax.Array) -> jax.Array:
     return exponent + jnp.log(ratio)
 
 
-def answer_probabilities(likelihood: Likelihood, margins: np.ndarray) -> np.ndarray:
+def prob(likelihood: Likelihood, margins: np.ndarray) -> np.ndarray:
     """p(answer | t), elementwise, in float64."""
     with jax.enable_x64(True):
         return np.exp(np.asarray(_log_prob(likelihood, margins)))
