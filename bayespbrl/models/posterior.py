@@ -15,7 +15,7 @@ from xarray.core import indexing
 from bayespbrl.diagnostics.convergence import Convergence, convergence
 from bayespbrl.models.elliptical_slice import EllipticalSlice, EllipticalSliceState
 from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
-from bayespbrl.models.likelihoods import Likelihood, WithTies, log_prob, preference_likelihood, total_log_prob
+from bayespbrl.models.likelihoods import Likelihood, WithTies, log_prob, preference_likelihood, prob, total_log_prob
 from bayespbrl.models.low_rank import LowRank, UtilityWeights, low_rank, used_rows
 from bayespbrl.models.preference_model import (
     PreferenceProblem,
@@ -173,8 +173,7 @@ def _fit_gaussian(differences: np.ndarray, prior_scale: float, likelihood: Likel
     approximation = expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale)
     log_evidence = approximation.log_evidence
     if not np.all(used):  # rows of zeros have a factor of their own; else nothing is compiled for a new K
-        with jax.enable_x64(True):
-            log_evidence += float(np.sum(np.asarray(_log_prob(likelihood, np.zeros(len(used))))[~used]))
+        log_evidence += float(np.sum(np.log(prob(likelihood, np.zeros(len(used)))[~used])))
     return GaussianFit(factors, likelihood, prior_scale, approximation, log_evidence)
 
 
@@ -242,9 +241,6 @@ class _Chains:
 
     def collected(self, name: str, length: int) -> np.ndarray:
         return np.concatenate([part[name] for part in self.draws], axis=1)[:, :length]
-
-
-_log_prob = jax.jit(log_prob)
 
 
 def _ellipses(model_args: tuple, model_kwargs: dict) -> list:
