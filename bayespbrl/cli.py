@@ -8,7 +8,7 @@ from typing import Annotated, TypedDict, Unpack, get_type_hints
 
 import typer
 
-from bayespbrl.screen import console, draw_trials, print_trials, progress_bar, run_to_the_end
+from bayespbrl.screen import PICTURE, console, draw_trials, print_trials, progress_bar, run_to_the_end, show_run
 
 app = typer.Typer(
     help="Preference-based reinforcement learning: a policy from answers to 'which of these two is better?'.",
@@ -108,11 +108,13 @@ def resume(directory: Annotated[Path, typer.Argument(help="Directory of a run th
     from bayespbrl import runs
 
     learner = runs.resume(directory)
-    if learner.finished:
+    if not learner.finished:
+        _expect_an_expert(learner.settings.expert)
+        run_to_the_end(learner)
+    elif not (directory / PICTURE).exists():  # stopped while it was drawn, or run in Python
+        show_run(learner)
+    else:
         console.print(f"{directory}: this run is finished; nothing is left to do.")
-        return
-    _expect_an_expert(learner.settings.expert)
-    run_to_the_end(learner)
 
 
 @app.command()

@@ -10,6 +10,7 @@ from rich.table import Table
 from bayespbrl.envs.opening import told
 
 console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may hold square brackets
+PICTURE = "run.png"
 
 
 def run_to_the_end(learner: Any) -> None:
@@ -24,12 +25,18 @@ def run_to_the_end(learner: Any) -> None:
     except KeyboardInterrupt:
         console.print(f"\nStopped. Nothing is lost: bayespbrl resume {directory}")
         raise
-    _print_iterations(learner)
+    show_run(learner)
+
+
+def show_run(learner: Any) -> None:
+    """The iterations of a logged learner, its film and its picture: where that is, all is."""
     from bayespbrl.diagnostics.plots import run_figure
 
-    picture = directory / "run.png"
+    directory = learner.log.path
+    _print_iterations(learner)
+    film, picture = _film(learner, directory), directory / PICTURE
     run_figure(learner).savefig(picture, dpi=110)
-    console.print(f"Run directory: {directory}\nPicture: {picture}\n{_film(learner, directory)}")
+    console.print(f"Run directory: {directory}\nPicture: {picture}\n{film}")
 
 
 def _film(learner: Any, directory: Path) -> str:

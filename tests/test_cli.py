@@ -12,6 +12,7 @@ import xarray as xr
 
 import bayespbrl
 from bayespbrl.cli import main
+from bayespbrl.experts import simulated_expert
 from bayespbrl.screen import print_trials
 from bayespbrl.trials import Trials
 
@@ -110,6 +111,18 @@ def test_resuming_a_finished_run_says_so(monkeypatch, capsys, tmp_path):
     capsys.readouterr()
     assert call(monkeypatch, "resume", out) == 0
     assert "finished" in capsys.readouterr().out
+    assert (out / "events.jsonl").read_bytes() == before
+
+
+def test_resuming_draws_the_pictures_that_a_finished_run_lacks(monkeypatch, capsys, tmp_path):
+    out = tmp_path / "run"
+    bayespbrl.start("gridworld", out, utility="linear-program", iterations=2, expert="other").run(simulated_expert())
+    before = (out / "events.jsonl").read_bytes()
+    assert call(monkeypatch, "resume", out) == 0
+    shown = capsys.readouterr().out
+    assert "run.png" in shown
+    assert "simulated expert" not in shown  # nobody answers
+    assert {path.name for path in out.glob("*.png")} == {"run.png", "final.png"}
     assert (out / "events.jsonl").read_bytes() == before
 
 
