@@ -5,11 +5,13 @@
 The first study is the one that the others are compared with. For each: the median and lower quartile of the value at
 some numbers of answers and at the end; how many trials are lost, which is to end below `--lost`; the answers at which
 median and lower quartile of the relative value (specification, section 1: (value − floor) / (ceiling − floor)) first
-reach 0.95, and the iterations at which they do; the median of the answers that a trial took; and the median difference
-to the first study over the same seeds, after as many answers as every trial of both gave and at the end, with 95 %
-bootstrap intervals. Answers are those given before the next question: where an iteration asked nothing, what it learnt
-counts for the answers before. A study is a directory of `bayespbrl trials` or its table. The floor is the random
-policy's value; the ceiling a number, or a study with the known reward, whose median it is.
+reach 0.95, with 95 % bootstrap intervals, and the iterations at which they do; the first study's answers until its
+lower quartile does, as a share of this study's; the median of the answers that a trial took; and the median difference
+to the first study, after as many answers as every trial of both gave and at the end. Shares and differences are over
+the same seeds, with 95 % bootstrap intervals. Answers are those given before the next question: where an iteration
+asked nothing, what it learnt counts for the answers before. A study is a directory of `bayespbrl trials` or its table,
+or several with different seeds, `a+b`, of which as many iterations count as all have. The floor is the random policy's
+value; the ceiling a number, or a study with the known reward, whose median it is.
 """
 
 import argparse
@@ -31,16 +33,20 @@ class Study:
     """
 
     def __init__(self, path: str):
-        table = Path(path)
-        table = table / "trials.csv" if table.is_dir() else table
-        self.name = table.parent.name if table.name == "trials.csv" else table.stem
+        tables = [Path(part) / "trials.csv" if Path(part).is_dir() else Path(part) for part in path.split("+")]
+        self.name = "+".join(table.parent.name if table.name == "trials.csv" else table.stem for table in tables)
         rows: dict[int, dict[int, tuple[int, float]]] = {}
-        with table.open() as lines:
-            for row in csv.DictReader(lines):
-                seed = rows.setdefault(int(row["seed"]), {})
-                seed[int(row["iteration"])] = int(row["answers"]), float(row["value"])
+        for table in tables:
+            before = set(rows)
+            with table.open() as lines:
+                for row in csv.DictReader(lines):
+                    if int(row["seed"]) in before:
+                        raise ValueError(f"{path}: expected tables with different seeds, got seed {row['seed']} twice")
+                    seed = rows.setdefault(int(row["seed"]), {})
+                    seed[int(row["iteration"])] = int(row["answers"]), float(row["value"])
         self.seeds = sorted(rows)
-        kept = [[rows[seed][iteration] for iteration in sorted(rows[seed])] for seed in self.seeds]
+        shared = min(map(len, rows.values()))
+        kept = [[rows[seed][iteration] for iteration in sorted(rows[seed])[:shared]] for seed in self.seeds]
         answers = np.array([[answers for answers, _ in trial] for trial in kept])
         self.by_iteration = np.array([[value for _, value in trial] for trial in kept])
         self.used = answers[:, -1]
@@ -50,19 +56,57 @@ class Study:
         """The value of each trial once so many answers are in; its last where it gave fewer."""
         return self.values[:, np.flatnonzero(self.answers <= answers)[-1]]
 
-    def answers_to(self, value: float, quantile: float) -> str:
-        """The first number of answers at which a quantile of the value is `value` or more."""
-        return first(self.answers, self.values, value, quantile)
-
-    def iterations_to(self, value: float, quantile: float) -> str:
-        """The first iteration at which it is."""
-        return first(1 + np.arange(self.by_iteration.shape[1]), self.by_iteration, value, quantile)
+    def of(self, seeds: list[int]) -> np.ndarray:
+        """The rows of these seeds."""
+        return np.array([self.seeds.index(seed) for seed in seeds])
 
 
-def first(numbers: np.ndarray, values: np.ndarray, value: float, quantile: float) -> str:
-    """The first of `numbers`, one a column of `values`, at which a quantile over the rows is `value` or more."""
-    reached = np.flatnonzero(np.quantile(values, quantile, axis=0) >= value)
-    return str(numbers[reached[0]]) if len(reached) else "never"
+def resampled(number: int) -> np.ndarray:
+    """Rows of the bootstrap, the same whenever there are as many trials; shape (samples, number)."""
+    return np.random.default_rng(0).integers(number, size=(10_000, number))
+
+
+def first(numbers: np.ndarray, values: np.ndarray, value: float, quantile: float) -> np.ndarray:
+    """The first of `numbers`, one a column, at which a quantile over the rows is `value` or more; inf if none is.
+
+    `values` may be a stack of tables, (…, trials, columns).
+    """
+    reached = np.quantile(values, quantile, axis=-2) >= value
+    return np.where(reached.any(axis=-1), numbers[reached.argmax(axis=-1)], np.inf)
+
+
+def answers_to(study: Study, value: float, quantile: float) -> str:
+    """The first number of answers at which a quantile of the value is `value` or more, with its bootstrap interval."""
+    samples = first(study.answers, study.values[resampled(len(study.seeds))], value, quantile)
+    low, high = np.quantile(samples, [0.025, 0.975], method="inverted_cdf")
+    return f"{told(first(study.answers, study.values, value, quantile))} [{told(low)}, {told(high)}]"
+
+
+def iterations_to(study: Study, value: float, quantile: float) -> str:
+    """The first iteration at which it is."""
+    return told(first(1 + np.arange(study.by_iteration.shape[1]), study.by_iteration, value, quantile))
+
+
+def told(number: float | np.ndarray) -> str:
+    return f"{number:g}" if np.isfinite(number) else "never"
+
+
+def share_of_answers(study: Study, reference: Study, value: float) -> str:
+    """The answers until the lower quartile of `reference` is at `value`, as a share of `study`'s, over the same seeds.
+
+    Where the study's is never there the share is 0, and where the reference's is not there is none.
+    """
+    seeds = [seed for seed in study.seeds if seed in reference.seeds]
+    if not seeds:
+        return "–"
+    shares = []
+    for chosen in (np.arange(len(seeds)), resampled(len(seeds))):
+        needed, by_reference = (
+            first(one.answers, one.values[one.of(seeds)[chosen]], value, 0.25) for one in (study, reference)
+        )
+        shares.append(np.where(np.isfinite(by_reference), by_reference / needed, np.inf))
+    low, high = np.quantile(shares[1], [0.025, 0.975], method="inverted_cdf")
+    return f"{shares[0]:.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(shares[0]) else "–"
 
 
 def paired(study: Study, reference: Study, answers: float) -> str:
@@ -70,10 +114,9 @@ def paired(study: Study, reference: Study, answers: float) -> str:
     seeds = [seed for seed in study.seeds if seed in reference.seeds]
     if not seeds:
         return "–"
-    value, before = (one.at(answers)[[one.seeds.index(seed) for seed in seeds]] for one in (study, reference))
+    value, before = (one.at(answers)[one.of(seeds)] for one in (study, reference))
     differences = value - before
-    chosen = np.random.default_rng(0).integers(len(seeds), size=(10_000, len(seeds)))
-    low, high = np.quantile(np.median(differences[chosen], axis=1), [0.025, 0.975])
+    low, high = np.quantile(np.median(differences[resampled(len(seeds))], axis=1), [0.025, 0.975])
     return f"{np.median(differences):+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
@@ -102,8 +145,8 @@ def main() -> None:
     most = max(np.median(study.used) for study in studies)
     columns = [answers for answers in COLUMNS if answers < most]
     names = [f"after {answers}" for answers in columns]
-    names += ["at the end", "lost", "median at 0.95", "lower quartile at 0.95", "in iterations", "answers in all"]
-    names += ["paired difference", "paired at the end"]
+    names += ["at the end", "lost", "median at 0.95", "lower quartile at 0.95", "in iterations", "the first's share"]
+    names += ["answers in all", "paired difference", "paired at the end"]
     print("| study | trials | " + " | ".join(names) + " |")
     print("|---|" + "---|" * (len(names) + 1))
     for study in studies:
@@ -111,10 +154,11 @@ def main() -> None:
         row = [summary(cell) for cell in [*cells, study.values[:, -1]]]
         row.append("–" if options.lost is None else str(int(np.sum(study.values[:, -1] < options.lost))))
         if reached is None:
-            row += ["–", "–", "–"]
+            row += ["–", "–", "–", "–"]
         else:
-            row += [study.answers_to(reached, quantile) for quantile in (0.5, 0.25)]
-            row.append("; ".join(study.iterations_to(reached, quantile) for quantile in (0.5, 0.25)))
+            row += [answers_to(study, reached, quantile) for quantile in (0.5, 0.25)]
+            row.append("; ".join(iterations_to(study, reached, quantile) for quantile in (0.5, 0.25)))
+            row.append("–" if study is studies[0] else share_of_answers(study, studies[0], reached))
         row.append(f"{np.median(study.used):g}")
         both = min(*study.used, *studies[0].used)
         row += ["–", "–"] if study is studies[0] else [paired(study, studies[0], end) for end in (both, np.inf)]

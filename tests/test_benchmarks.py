@@ -87,14 +87,39 @@ def test_studies_are_compared_seed_by_seed(tmp_path):
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines[0] == "relative value 0.95: 22.32"  # 0.95 of the median of 22 and 25
     first, second, longer, less, uneven = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
-    assert first == ["first", "3", "12 [8]", "1", "never", "never", "never; never", "4", "–", "–"]
+    never = "never [never, never]"
+    assert first == ["first", "3", "12 [8]", "1", never, never, "never; never", "–", "4", "–", "–"]
     # seeds 3 and 1 differ by 10 and 5, in the second study's order as in any other
-    assert second == ["second", "2", "23.5 [22.75]", "0", "4", "4", "3; 3", "4", *2 * ["+7.5 [+5.0, +10.0]"]]
+    # drawn twice, seed 3 alone is never at the line
+    reached = ["4 [4, never]", "4 [4, never]", "3; 3", "–"]
+    assert second == ["second", "2", "23.5 [22.75]", "0", *reached, "4", *2 * ["+7.5 [+5.0, +10.0]"]]
     # a longer study is compared with the first at the answers that both have
-    assert longer[:-1] == ["longer", "2", "-999 [-999]", "2", "4", "4", "3; 3", "5", "+7.5 [+5.0, +10.0]"]
+    assert longer[:-1] == ["longer", "2", "-999 [-999]", "2", *reached, "5", "+7.5 [+5.0, +10.0]"]
     assert longer[-1] == "-1015.0 [-1019.0, -1011.0]"
     # what it learns without asking counts for the answers before: 22 and 25 after two, where the first study has 0
-    assert less == ["asks-less", "2", "23.5 [22.75]", "0", "2", "2", "3; 3", "2", "+23.5 [+22.0, +25.0]", second[-1]]
+    reached = ["2 [2, never]", "2 [2, never]", "3; 3", "–"]
+    assert less == ["asks-less", "2", "23.5 [22.75]", "0", *reached, "2", "+23.5 [+22.0, +25.0]", second[-1]]
     # after two answers 30, 5 and 5, where the first study has 0 each; at the end 30, 40, 50, where it has 20, 4, 12
     assert uneven[0] == "uneven"
     assert uneven[-3:] == ["3", "+5.0 [+5.0, +30.0]", "+36.0 [+10.0, +38.0]"]
+
+
+def test_studies_of_different_seeds_are_joined_and_their_answers_are_shares(tmp_path):
+    header = "seed,iteration,answers,value"
+    at = {"soon": [(1, 2), (2, 2)], "later": [(3, 2), (4, 3)], "slow": [(seed, 3) for seed in range(1, 5)]}
+    for name, trials in at.items():
+        rows = [f"{seed},{i},{i + 1},{i >= reached:d}" for seed, reached in trials for i in range(1, 5)]
+        (tmp_path / f"{name}.csv").write_text("\n".join([header, *rows]))
+    with (tmp_path / "later.csv").open("a") as longer:
+        longer.write("\n3,5,6,-1\n4,5,6,-1")  # an iteration that not all have
+    joined = f"{tmp_path / 'soon.csv'}+{tmp_path / 'later.csv'}"
+    command = [sys.executable, str(BENCHMARKS / "compare.py"), "--floor", "0", "--ceiling", "1"]
+    shown = subprocess.run([*command, joined, tmp_path / "slow.csv"], capture_output=True, text=True, check=True).stdout
+    both, slow = ([cell.strip() for cell in line.split("|")[1:-1]] for line in shown.splitlines()[3:])
+    assert both[:3] == ["soon+later", "4", "1 [1]"]
+    # after 3 answers three of the four trials are there: their lower quartile is 0.75, drawn anew often 1
+    assert both[-7:-3] == ["3 [3, 4]", "4 [3, 4]", "2; 3", "–"]
+    assert slow[-7:-3] == ["4 [4, 4]", "4 [4, 4]", "3; 3", "1.00 [0.75, 1.00]"]
+    twice = f"{tmp_path / 'soon.csv'}+{tmp_path / 'slow.csv'}"
+    refused = subprocess.run([*command, twice], capture_output=True, text=True, check=False)
+    assert "expected tables with different seeds, got seed 1 twice" in refused.stderr
