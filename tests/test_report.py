@@ -232,6 +232,40 @@ def test_the_utility_of_states_is_that_of_the_estimate_with_the_spread_of_its_dr
     assert table.sizes["draw"] == 3
 
 
+def test_progress_is_what_the_last_estimate_thinks_of_each_iterations_trajectories(finished, copy):
+    run = bayespbrl.load(finished)
+    draws = run.estimate.trajectory_draws(run.trajectories)
+    by_iteration = draws.reshape(len(draws), 3, 10).mean(axis=2)
+    over_the_last = by_iteration - by_iteration[:, [2]]
+    table = report_tables.progress_table(read_evidence(finished))
+    assert table["iteration"].values.tolist() == [1, 2, 3]
+    expected = run.estimate.trajectory_utilities(run.trajectories).reshape(3, 10).mean(axis=1)
+    np.testing.assert_allclose(table["utility"], expected - expected[2])
+    spread = over_the_last.std(axis=0).max()
+    np.testing.assert_allclose(table["lower"], np.quantile(over_the_last, 0.05, axis=0), atol=0.1 * spread)
+    np.testing.assert_allclose(table["upper"], np.quantile(over_the_last, 0.95, axis=0), atol=0.1 * spread)
+    assert float(table["lower"][0]) < float(table["utility"][0]) < float(table["upper"][0])
+    (copy / "iterations" / "0002.nc").unlink()
+    assert report_tables.progress_table(read_evidence(copy))["iteration"].values.tolist() == [1, 3]
+
+
+def test_the_head_says_for_how_long_nothing_better_has_come(tmp_path):
+    asked = []
+
+    def expert(first, second):  # the newcomer of the third question is the best for good
+        newcomer = learner.ask()[0].newcomer
+        asked.append(newcomer)
+        better = asked.index(newcomer) < 3
+        return "first" if (first is learner.trajectories[newcomer]) == better else "second"
+
+    learner = start(tmp_path / "run", iterations=5)
+    learner.run(expert)
+    best = asked[2]
+    text = read(write_report(tmp_path / "run")).text
+    assert f"Undominated among all trajectories that were compared: number {best} (of iteration 2)." in text
+    assert "3 comparisons since then brought nothing better." in text
+
+
 @pytest.mark.parametrize(("observations", "kind", "size"), [(1, "line", 60), (2, "plane", 3600), (4, "cloud", 11 * 30)])
 def test_states_of_any_dimension_are_shown(tmp_path, observations, kind, size):
     env = Drift(observations)
@@ -274,13 +308,15 @@ def test_every_figure_takes_axes_and_returns_them_and_every_table_is_a_data_set(
     states, answers = report_tables.utility_table(evidence), report_tables.answers_table(evidence)
     scores, compared = report_tables.prequential_table(evidence), report_tables.trajectories_table(evidence)
     ranking = report_tables.ranking_table(evidence)
-    assert all(isinstance(table, xr.Dataset) for table in (iterations, states, answers, scores, compared, ranking))
+    progress = report_tables.progress_table(evidence)
+    tables = (iterations, states, answers, scores, compared, ranking, progress)
+    assert all(isinstance(table, xr.Dataset) for table in tables)
     best = bayespbrl.load(finished).preferences.undominated[-1]
     assert set(ranking["trajectory"].values.tolist()) == {*range(20, 30), best}  # the newest, and the undominated one
     line = states.assign_attrs(kind="line")
     calls = [(report_figures.plot_column, iterations, "kl"), (report_figures.plot_answers, answers)]
     calls += [(report_figures.plot_states, states, states["mean"].values), (report_figures.plot_state_bands, line)]
-    calls += [(report_figures.plot_trajectories, compared)]
+    calls += [(report_figures.plot_trajectories, compared), (report_figures.plot_progress, progress)]
     names = ("plot_value", "plot_rhat", "plot_effective_sample_size", "plot_bound", "plot_temperature", "plot_entropy")
     calls += [(getattr(report_figures, name), iterations) for name in names]
     drawers = {name for name in vars(report_figures) if name.startswith("plot_")}
@@ -433,6 +469,7 @@ def test_a_utility_without_a_posterior_is_said_to_have_none(tmp_path, utility):
     start(tmp_path / "run", utility=utility).run(ReturnExpert())
     text = read(write_report(tmp_path / "run")).text
     assert f"utility is {utility}, which has no posterior" in text
+    assert ("No reward enters" in text) == (utility == "linear-program")
     assert "could not be made" not in text
 
 

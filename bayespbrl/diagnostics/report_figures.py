@@ -26,6 +26,21 @@ def plot_value(table: xr.Dataset, axes: Axes, *, optimum: float | None = None) -
     return axes
 
 
+def plot_progress(table: xr.Dataset, axes: Axes) -> Axes:
+    """What the last estimate thinks of each iteration's trajectories, with its 90 % interval, over the last's."""
+    iterations = table["iteration"].values
+    if "lower" in table:
+        axes.fill_between(
+            iterations, table["lower"], table["upper"], alpha=0.25, linewidth=0, color=SETTLED, label="90 % interval"
+        )
+    axes.plot(iterations, table["utility"], marker="o", markersize=3.5, color=SETTLED, label="expected utility")
+    axes.axhline(0, color="0.4", linestyle="--", linewidth=1)
+    axes.set(xlabel="iteration", ylabel="inferred utility over the last's")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.legend()
+    return axes
+
+
 def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = 1.01) -> Axes:
     """Largest R̂ of each iteration's fit."""
     _series(table, axes, {"rhat_max": "largest R̂"}, converged="utility_converged")

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl.diagnostics.report_evidence import Evidence
+from bayespbrl.preferences import Answer
 from bayespbrl.settings import WITHOUT_POSTERIOR
 
 ENOUGH_PREDICTIONS = 10  # to judge calibration by
@@ -34,10 +35,7 @@ def learnt(
             f"Since the first iteration it gave the answers that came {percent(mean)} probability beforehand "
             f"(geometric mean), and more than half to {percent(np.mean(before > 0.5))} of them. {_calibrated(scores)}"
         )
-    if undominated := evidence.preferences.undominated:
-        named = ", ".join(str(n) for n in undominated)
-        sentences.append(f"Undominated among all trajectories that were compared: number {named}.")
-    return sentences
+    return sentences + _undominated(evidence)
 
 
 def iterations_that_asked_nothing(evidence: Evidence, iterations: xr.Dataset) -> int:
@@ -140,6 +138,19 @@ def _sureness(evidence: Evidence, ranking: xr.Dataset) -> list[str]:
         wins = percent(float(ranking["best_probability"].sel(trajectory=best)))
         sentences.append(f"With probability {wins} trajectory {best}, undominated so far, is the best of these.")
     return sentences
+
+
+def _undominated(evidence: Evidence) -> list[str]:
+    """Which are the best so far, and for how long nothing better has come."""
+    best = evidence.preferences.undominated
+    if not best:
+        return []
+    size = evidence.settings.trajectories_per_iteration
+    named = ", ".join(f"{n} (of iteration {n // size + 1})" for n in best)
+    text = f"Undominated among all trajectories that were compared: number {named}."
+    compared = [record for record in evidence.answers if record.answer is not Answer.SKIP]
+    since = max(0, sum(best[-1] in (record.first, record.second) for record in compared) - 1)  # the first set it there
+    return [text + (f" {count(since, 'comparison')} since then brought nothing better." if since else "")]
 
 
 def _calibrated(scores: xr.Dataset) -> str:

@@ -13,6 +13,7 @@ from bayespbrl.diagnostics.prequential import plot_calibration
 from bayespbrl.diagnostics.report_document import Section, Table, drawn
 from bayespbrl.diagnostics.report_evidence import Evidence
 from bayespbrl.diagnostics.report_findings import cell, figure, iterations_that_asked_nothing, no_posterior
+from bayespbrl.diagnostics.report_tables import progress_table
 from bayespbrl.diagnostics.uncertainty import thinned
 from bayespbrl.settings import WITHOUT_POSTERIOR
 
@@ -20,7 +21,7 @@ RANKED = 4
 
 
 def learning(evidence: Evidence, iterations: xr.Dataset) -> Section:
-    """The learning curve."""
+    """The learning curve, by the hidden reward and by the inferred utility."""
     if not iterations.sizes["iteration"]:
         return Section("learning", "Learning curve", ["No iteration is completed yet."])
     optimum = getattr(evidence.dynamics, "optimal_return", None)
@@ -33,9 +34,18 @@ def learning(evidence: Evidence, iterations: xr.Dataset) -> Section:
     )
     first, last = float(iterations["value"][0]), float(iterations["value"][-1])
     alt = f"Learning curve: value from {figure(first)} to {figure(last)} over {int(iterations['answers'][-1])} answers."
-    return Section(
-        "learning", "Learning curve", [], [drawn("learning", panels, caption, alt, columns=1, size=(7.6, 3.3))]
-    )
+    blocks = [drawn("learning", panels, caption, alt, columns=1, size=(7.6, 3.3))]
+    if hasattr(evidence.estimate, "weights") and not evidence.features_missing:  # the reward itself has none
+        panels = [("By the inferred utility", partial(figures.plot_progress, progress_table(evidence)))]
+        caption = (
+            "What the last estimate thinks of the trajectories of each iteration, over those of the last; the scale is "
+            "free. No reward enters, so this is the learning curve of a run whose answers a person gives. Where the "
+            "interval is below zero the policy has become better since, by this utility; where it is level and holds "
+            "zero nothing more was gained, and whether what was gained is good is seen in the trajectories."
+        )
+        alt = "The inferred utility of each iteration's trajectories."
+        blocks.append(drawn("progress", panels, caption, alt, columns=1, size=(7.6, 3.0)))
+    return Section("learning", "Learning curve", [], blocks)
 
 
 def fits(evidence: Evidence, iterations: xr.Dataset) -> Section:

@@ -169,6 +169,39 @@ def trajectories_table(evidence: Evidence) -> xr.Dataset:
     return xr.Dataset(data, coords={"trajectory": numbers})
 
 
+def progress_table(evidence: Evidence) -> xr.Dataset:
+    """What the last estimate thinks of each iteration's trajectories, along `iteration`: a learning curve that needs no
+    reward.
+
+    Returns:
+      `utility`, the mean over the iteration's trajectories less that of the last, and where there is a posterior
+      `lower` and `upper`, the 90 % interval of that difference; only iterations whose trajectories can all be read.
+
+    Raises:
+      ValueError: no estimate; features that were not passed again.
+    """
+    if not hasattr(evidence.estimate, "trajectory_utilities"):
+        raise ValueError("utility: expected an estimate, got none")
+    size = evidence.settings.trajectories_per_iteration
+    first = range(0, max(evidence.trajectories, default=-1) + 1, size)
+    batches = [range(n, n + size) for n in first if all(i in evidence.trajectories for i in range(n, n + size))]
+    shown = [evidence.trajectories[n] for batch in batches for n in batch]
+    iterations = [batch[0] // size + 1 for batch in batches]
+    if not shown:
+        return xr.Dataset({"utility": ("iteration", np.zeros(0))}, coords={"iteration": iterations})
+
+    def over_the_last(utilities: np.ndarray) -> np.ndarray:
+        means = utilities.reshape(*utilities.shape[:-1], -1, size).mean(axis=-1)
+        return means - means[..., -1:]
+
+    data = {"utility": ("iteration", over_the_last(evidence.estimate.trajectory_utilities(shown)))}
+    if evidence.posterior is not None:
+        draws = over_the_last(evidence.estimate.trajectory_draws(shown, number=DRAWS))
+        for name, level in (("lower", 0.05), ("upper", 0.95)):
+            data[name] = ("iteration", np.quantile(draws, level, axis=0))
+    return xr.Dataset(data, coords={"iteration": iterations})
+
+
 def ranking_table(evidence: Evidence) -> xr.Dataset:
     """What the posterior says about the order of the newest iteration's trajectories and the undominated one.
 
