@@ -135,6 +135,24 @@ class RunDirectory:
                 raise ValueError(f"events.jsonl, line {number}: expected an event, got {line[:60]!r}")
             yield event
 
+    def expect_whole(self, state: LearnerState) -> None:
+        """That the log is not shorter than the summary knows: who went on with it would write over what it lost.
+
+        An event that was interrupted can leave the summary one iteration ahead, and one that takes an answer back more.
+
+        Raises:
+          ValueError: iterations are missing from the log.
+        """
+        try:
+            known = len(read_summary(self.path)["iterations"])
+        except (ValueError, TypeError):
+            return  # it is written anew from the log
+        if known <= state.iteration + 1 or any(event["event"] == "undone" for event in list(self._events())[-1:]):
+            return
+        raise ValueError(
+            f"events.jsonl: expected the {known} completed iterations that summary.json tells of, got {state.iteration}"
+        )
+
     def drop_partial_line(self) -> None:
         """Cut off a last line that a killed process left half-written, so that the next event starts a new one."""
         file = self.path / "events.jsonl"

@@ -92,7 +92,7 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
     if settings.environment == "other" and env is None:
         raise ValueError(f"{log.path}: a run with an environment of the user's own: expected it again as env=")
     try:
-        return Learner(
+        learner = Learner(
             settings.env if env is None else env,
             features=features,
             policy=policy,
@@ -100,8 +100,10 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
             entries=log.entries(features=features, known=() if policy is None else (type(policy),)),
             kept=settings,
         )
+        log.expect_whole(learner.state)
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
+    return learner
 
 
 @dataclass(frozen=True)

@@ -346,7 +346,8 @@ def test_what_was_undone_does_not_hinder_reading_what_came_after(copy):
 
 def test_a_last_line_that_was_cut_off_is_recovered(copy, straight):
     whole = (copy / "events.jsonl").read_bytes()
-    for cut in (1, 30, 400, 1400):
+    last = len(whole.splitlines()[-1])
+    for cut in (1, 30, 400, last + 100):  # the last: of two lines, which leaves the summary an iteration ahead
         (copy / "events.jsonl").write_bytes(whole[:-cut])
         before = contents(copy)
         assert bayespbrl.load(copy).preferences.answers <= 4
@@ -392,6 +393,30 @@ def test_a_run_killed_between_any_two_writes_goes_on_as_if_it_had_not_been(tmp_p
         assert (summary["finished"], len(summary["iterations"])) == (True, 3)
         assert {file.name for file in path.iterdir()} <= FILES | {"summary.json.part"}
         shutil.rmtree(path)
+
+
+@pytest.mark.parametrize("lines", [None, 0, 4])
+def test_a_log_that_has_lost_iterations_is_refused_and_nothing_is_written_over(copy, lines):
+    log = copy / "events.jsonl"
+    if lines is None:
+        log.unlink()
+    else:
+        log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[:lines]))
+    before = contents(copy)
+    for read in (runs.resume, bayespbrl.load):
+        with pytest.raises(ValueError, match=r"expected the 3 completed iterations that summary.json tells of, got 0"):
+            read(copy)
+    assert contents(copy) == before
+
+
+def test_an_undoing_that_was_killed_before_its_summary_is_no_lost_iteration(copy):
+    summary = (copy / "summary.json").read_bytes()
+    learner = runs.resume(copy)
+    for _ in range(3):
+        learner.undo()
+    (copy / "summary.json").write_bytes(summary)
+    assert runs.resume(copy).state.iteration == 0
+    assert json.loads((copy / "summary.json").read_text())["iterations"] == []
 
 
 def test_a_summary_that_a_killed_process_left_old_is_brought_up_to_date(copy):

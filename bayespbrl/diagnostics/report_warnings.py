@@ -181,7 +181,9 @@ def _mending(text: str) -> str:
     if text.startswith("iterations/"):
         return "What this file alone held is missing here. Bring it back from a copy; the run cannot go on without it."
     if "last line is cut off" in text:
-        return "Nothing to do: bayespbrl resume drops the rest of a line and goes on."
+        return "If nothing else is broken, nothing to do: bayespbrl resume drops the rest of a line and goes on."
+    if text.startswith("events.jsonl holds"):
+        return "The figures of summary.json are used. Bring the log back from a copy; without it the run cannot go on."
     if "environment" in text:
         return "Register it first, or call bayespbrl.load(directory, env=...).report() with the object."
     return "What the log says up to there is used. Bring the file back from a copy to go on with the run."
