@@ -495,6 +495,23 @@ def test_features_of_ones_own_are_asked_for_and_used_when_passed(tmp_path):
     assert "The utility over the cells of the grid" in passed
 
 
+def test_a_run_that_the_command_line_cannot_go_on_with_is_sent_to_python(tmp_path):
+    learner = start(tmp_path / "mine", expert="other")
+    learner.tell([ReturnExpert()(*query.trajectories) for query in learner.ask()])
+    text = read(write_report(tmp_path / "mine")).text
+    assert f"bayespbrl.resume('{tmp_path / 'mine'}') goes on in Python" in text
+    assert "bayespbrl resume" not in text
+
+
+def test_a_log_that_has_lost_iterations_is_not_said_to_be_in_order(copy):
+    log = copy / "events.jsonl"
+    log.write_bytes(log.read_bytes()[:700])
+    cautions = {warning.what: warning.do for warning in assembled(read_evidence(copy))["warnings"]}
+    lost = next(do for what, do in cautions.items() if "completed iterations, summary.json 3" in what)
+    assert "without it the run cannot go on" in lost
+    assert not any(do.startswith("Nothing to do") for do in cautions.values())
+
+
 def test_an_environment_that_cannot_be_opened_costs_only_what_needs_it(copy):
     settings = json.loads((copy / "settings.json").read_text())
     (copy / "settings.json").write_text(json.dumps(settings | {"env": "Mine-v0"}))

@@ -111,7 +111,11 @@ def _state(evidence: Evidence) -> str:
     if evidence.finished:
         return f"Finished: {done} iterations."
     waiting = "" if evidence.waiting is None else f" Question {evidence.waiting} waits for an answer."
-    return f"In progress: {done} of {wanted} iterations.{waiting} bayespbrl resume {evidence.path} goes on."
+    text = f"In progress: {done} of {wanted} iterations.{waiting} "
+    parts = ("expert", "features", "policy", "schedule", "environment")
+    if any(getattr(evidence.settings, part) == "other" for part in parts):
+        return text + f"bayespbrl.resume({str(evidence.path)!r}) goes on in Python, given what was the user's own."
+    return text + f"bayespbrl resume {evidence.path} goes on."
 
 
 def _facts(evidence: Evidence) -> list[tuple[str, str]]:
