@@ -9,7 +9,7 @@ expectation propagation's Gaussian for the weights (Bayesian model averaging; Ho
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.special import softmax
@@ -34,8 +34,9 @@ class AveragedUtility(LinearUtility):
     """A mixture over settings, round the one that the evidence speaks for most.
 
     What the learner acts on is the mixture's: `utilities`, `step_utilities`, `trajectory_utilities`, `state_draws`,
-    `trajectory_draws`, `margin_draws` and `utilities_and_draws`. All else is of that one setting, whose posterior was
-    sampled and can be diagnosed.
+    `trajectory_draws`, `margin_draws` and `utilities_and_draws`; so is the number of pairs that it satisfies. All else
+    is of that one setting, whose posterior was sampled and can be diagnosed: `likelihood` too, with the steepness and
+    the lapse rate that the evidence chose, though the mixture's draws are of several and of the lapse rate as given.
 
     Attributes:
       base: φ as given.
@@ -145,7 +146,7 @@ def average_utility(
     settings = np.minimum(np.searchsorted(np.cumsum(weights), evenly), weights.size - 1)
     components, steepnesses = np.divmod(settings, len(STEEPNESS_MULTIPLES))
     draws = [_draw(fits[counts[c]][m], rng) / scales[counts[c]] for c, m in zip(components, steepnesses, strict=True)]
-    return AveragedUtility(
+    averaged = AveragedUtility(
         **{field.name: getattr(chosen, field.name) for field in fields(chosen)},
         base=features,
         multiples=multiples[counts],
@@ -154,6 +155,9 @@ def average_utility(
         components=components,
         weight_draws=np.array(draws, dtype=np.float32),  # kept on disk; half of float64, and read back as they are
     )
+    expected = averaged.trajectory_utilities(shown)
+    satisfied = sum(bool(expected[i] > expected[j]) for i, j in rows)
+    return replace(averaged, quality=replace(chosen.quality, pairs_satisfied=satisfied))
 
 
 def _grid(dimensions: int, rng: np.random.Generator) -> np.ndarray:

@@ -10,7 +10,7 @@ from bayespbrl.features import OneHot, RadialBasis
 from bayespbrl.iteration_files import read_iteration
 from bayespbrl.runs import start
 from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility import estimate_utility
+from bayespbrl.utility import LinearUtility, estimate_utility
 
 LINE = RadialBasis(np.linspace(-1, 1, 5)[:, None], np.array([0.4]), np.array([np.inf]), normalised=True)
 PAIRS = [(0, 1), (0, 2), (3, 2)]
@@ -35,6 +35,20 @@ def averaged(features, trajectories, pairs, *, likelihood="logistic", seed=0):
         trajectories, pairs, choice.features, method="posterior-mean", steepness=choice.steepness, **options
     )
     return average_utility(chosen, trajectories, pairs, features, seed=seed, **options)
+
+
+def test_the_pairs_that_it_satisfies_are_counted_by_the_average_and_not_by_the_likeliest_setting():
+    trajectories = walks(7)
+    for seed in range(40):
+        order = np.random.default_rng(seed).permutation(7)  # answers that no utility of the features need explain
+        pairs = list(zip(order[:-1].tolist(), order[1:].tolist(), strict=True))
+        estimate = averaged(LINE, trajectories, pairs)
+        mixed = estimate.trajectory_utilities(trajectories)
+        assert estimate.quality.pairs_satisfied == sum(mixed[i] > mixed[j] for i, j in pairs)
+        own = LinearUtility.trajectory_utilities(estimate, trajectories)
+        if estimate.quality.pairs_satisfied != sum(own[i] > own[j] for i, j in pairs):
+            return
+    pytest.fail("no case in which the two differ")
 
 
 def test_mean_and_spread_are_those_of_the_mixture_by_importance_sampling():
