@@ -8,7 +8,7 @@ A schedule is called once an iteration, after the utility and Q are estimated an
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -116,7 +116,7 @@ def decided(schedule: Schedule, situation: Situation) -> Bound:
     """What `schedule` decides, checked.
 
     Raises:
-      ValueError: anything but a positive finite number, or statistics that a run cannot keep by name, naming the
+      ValueError: anything but a positive finite number, or a reason or statistics that a run cannot keep, naming the
         schedule.
     """
     bound = schedule(situation)
@@ -127,6 +127,9 @@ def decided(schedule: Schedule, situation: Situation) -> Bound:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value <= 0:
         raise ValueError(f"schedule {name}: expected a positive finite KL bound, got {value!r}")
+    if not isinstance(bound.reason, str) or not isinstance(bound.statistics, Mapping):
+        got = f"{bound.reason!r} and {bound.statistics!r}"
+        raise ValueError(f"schedule {name}: expected a reason in words and statistics by name, got {got}")
     for key, figure in bound.statistics.items():
         if not isinstance(key, str) or key == "reason" or not _kept(figure):
             raise ValueError(f"schedule {name}: expected statistics that are numbers by name, got {key!r}: {figure!r}")

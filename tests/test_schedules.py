@@ -123,6 +123,12 @@ def test_statistics_that_could_not_be_kept_are_named(statistics):
         decided(lambda situation: Bound(0.2, "mine", statistics), situation(proposed()))
 
 
+@pytest.mark.parametrize("bound", [Bound(0.3, "x", None), Bound(0.3, {1, 2}, {}), Bound(0.3, None)])
+def test_a_reason_that_is_no_text_and_statistics_without_names_are_refused(bound):
+    with pytest.raises(ValueError, match=r"schedule <lambda>: expected a reason in words and statistics by name, got"):
+        decided(lambda situation: bound, situation(proposed()))
+
+
 def test_statistics_may_be_flags_texts_and_lists():
     statistics = {"sure": np.bool_(True), "why": "x", "gains": [1.0, np.float64(2.0)], "none": None}
     assert decided(lambda situation: Bound(0.2, "mine", statistics), situation(proposed())).statistics == statistics
