@@ -104,7 +104,8 @@ def share_of_answers(study: Study, reference: Study, value: float) -> str:
         needed, by_reference = (
             first(one.answers, one.values[one.of(seeds)[chosen]], value, 0.25) for one in (study, reference)
         )
-        shares.append(np.where(np.isfinite(by_reference), by_reference / needed, np.inf))
+        with np.errstate(invalid="ignore"):  # where neither is ever there
+            shares.append(np.where(np.isfinite(by_reference), by_reference / needed, np.inf))
     low, high = np.quantile(shares[1], [0.025, 0.975], method="inverted_cdf")
     return f"{shares[0]:.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(shares[0]) else "–"
 
@@ -112,7 +113,7 @@ def share_of_answers(study: Study, reference: Study, value: float) -> str:
 def paired(study: Study, reference: Study, answers: float) -> str:
     """The median difference after so many answers, over the seeds of both, with its bootstrap interval."""
     seeds = [seed for seed in study.seeds if seed in reference.seeds]
-    if not seeds:
+    if not seeds or answers < max(study.answers[0], reference.answers[0]):
         return "–"
     value, before = (one.at(answers)[one.of(seeds)] for one in (study, reference))
     differences = value - before
@@ -125,6 +126,14 @@ def summary(values: np.ndarray | None) -> str:
     return "–" if values is None else f"{np.median(values):.4g} [{np.quantile(values, 0.25):.4g}]"
 
 
+def ceiling_of(number_or_study: str) -> float:
+    """A number, or the median of what a study ends with."""
+    try:
+        return float(number_or_study)
+    except ValueError:
+        return float(np.median(Study(number_or_study).values[:, -1]))
+
+
 def main() -> None:
     """Read the studies and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -133,13 +142,13 @@ def main() -> None:
     parser.add_argument("--ceiling", help="value, or study, of the known reward")
     parser.add_argument("--lost", type=float, help="a trial that ends below is lost")
     options = parser.parse_args()
-    studies = [Study(path) for path in options.studies]
+    try:
+        studies = [Study(path) for path in options.studies]
+        ceiling = None if options.ceiling is None else ceiling_of(options.ceiling)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
     reached = None
-    if options.floor is not None and options.ceiling is not None:
-        try:
-            ceiling = float(options.ceiling)
-        except ValueError:
-            ceiling = float(np.median(Study(options.ceiling).values[:, -1]))
+    if options.floor is not None and ceiling is not None:
         reached = options.floor + REACHED * (ceiling - options.floor)
         print(f"relative value {REACHED}: {reached:.4g}")
     most = max(np.median(study.used) for study in studies)
@@ -150,7 +159,8 @@ def main() -> None:
     print("| study | trials | " + " | ".join(names) + " |")
     print("|---|" + "---|" * (len(names) + 1))
     for study in studies:
-        cells = [study.at(answers) if answers <= np.median(study.used) else None for answers in columns]
+        begun, ended = study.answers[0], np.median(study.used)
+        cells = [study.at(answers) if begun <= answers <= ended else None for answers in columns]
         row = [summary(cell) for cell in [*cells, study.values[:, -1]]]
         row.append("–" if options.lost is None else str(int(np.sum(study.values[:, -1] < options.lost))))
         if reached is None:

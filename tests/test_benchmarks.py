@@ -120,6 +120,12 @@ def test_studies_of_different_seeds_are_joined_and_their_answers_are_shares(tmp_
     # after 3 answers three of the four trials are there: their lower quartile is 0.75, drawn anew often 1
     assert both[-7:-3] == ["3 [3, 4]", "4 [3, 4]", "2; 3", "–"]
     assert slow[-7:-3] == ["4 [4, 4]", "4 [4, 4]", "3; 3", "1.00 [0.75, 1.00]"]
+    (tmp_path / "late.csv").write_text("\n".join([header, "1,1,9,1", "2,1,9,1"]))
+    shown = subprocess.run([*command, joined, tmp_path / "late.csv"], capture_output=True, text=True, check=True)
+    assert shown.stderr == ""
+    assert shown.stdout.splitlines()[-1].startswith("| late | 2 | – | – | 1 [1] | – | 9 [9, 9] |")
     twice = f"{tmp_path / 'soon.csv'}+{tmp_path / 'slow.csv'}"
     refused = subprocess.run([*command, twice], capture_output=True, text=True, check=False)
+    assert "error: " in refused.stderr
     assert "expected tables with different seeds, got seed 1 twice" in refused.stderr
+    assert refused.returncode == 2
