@@ -135,18 +135,25 @@ class RunDirectory:
                 raise ValueError(f"events.jsonl, line {number}: expected an event, got {line[:60]!r}")
             yield event
 
-    def expect_whole(self, state: LearnerState) -> None:
-        """That the log is not shorter than the summary knows: who went on with it would write over what it lost.
+    def summarised(self) -> int:
+        """How many iterations `summary.json` tells of; 0 where it cannot be read, for it is made anew from the log."""
+        try:
+            return len(read_summary(self.path)["iterations"])
+        except (ValueError, TypeError):
+            return 0
+
+    def expect_whole(self, state: LearnerState, known: int) -> None:
+        """That the log is not shorter than the summary: who went on with it would write over what it lost.
 
         An event that was interrupted can leave the summary one iteration ahead, and one that takes an answer back more.
+
+        Args:
+          state: by the log.
+          known: what was `summarised` before the log was read, for another process may be going on with the run.
 
         Raises:
           ValueError: iterations are missing from the log.
         """
-        try:
-            known = len(read_summary(self.path)["iterations"])
-        except (ValueError, TypeError):
-            return  # it is written anew from the log
         if known <= state.iteration + 1 or any(event["event"] == "undone" for event in list(self._events())[-1:]):
             return
         raise ValueError(

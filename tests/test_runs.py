@@ -409,6 +409,23 @@ def test_a_log_that_has_lost_iterations_is_refused_and_nothing_is_written_over(c
     assert contents(copy) == before
 
 
+def test_a_run_that_goes_on_while_it_is_read_has_lost_nothing(copy, monkeypatch):
+    log, whole = copy / "events.jsonl", (copy / "events.jsonl").read_bytes()
+    summary = (copy / "summary.json").read_text()
+    log.write_bytes(whole.splitlines(keepends=True)[0])
+    (copy / "summary.json").unlink()
+    replay = bayespbrl.events.replay
+
+    def meanwhile(*arguments):  # another process completes all iterations after the log was read
+        state = replay(*arguments)
+        (copy / "summary.json").write_text(summary)
+        log.write_bytes(whole)
+        return state
+
+    monkeypatch.setattr(bayespbrl.events, "replay", meanwhile)
+    assert bayespbrl.load(copy).iterations == []
+
+
 def test_an_undoing_that_was_killed_before_its_summary_is_no_lost_iteration(copy):
     summary = (copy / "summary.json").read_bytes()
     learner = runs.resume(copy)
