@@ -146,7 +146,14 @@ def average_utility(
     settings = np.minimum(np.searchsorted(np.cumsum(weights), evenly), weights.size - 1)
     components, steepnesses = np.divmod(settings, len(STEEPNESS_MULTIPLES))
     draws = [_draw(fits[counts[c]][m], rng) / scales[counts[c]] for c, m in zip(components, steepnesses, strict=True)]
-    averaged = AveragedUtility(
+    # what each component expects of the margins, weighted: no features are needed again
+    margins = sum(
+        p * (fit.factors.loadings @ fit.approximation.mean)
+        for c, index in enumerate(counts)
+        for p, fit in zip(weights[c], fits[index], strict=True)
+    )
+    chosen = replace(chosen, quality=replace(chosen.quality, pairs_satisfied=int(np.sum(margins > 0))))
+    return AveragedUtility(
         **{field.name: getattr(chosen, field.name) for field in fields(chosen)},
         base=features,
         multiples=multiples[counts],
@@ -155,9 +162,6 @@ def average_utility(
         components=components,
         weight_draws=np.array(draws, dtype=np.float32),  # kept on disk; half of float64, and read back as they are
     )
-    expected = averaged.trajectory_utilities(shown)
-    satisfied = sum(bool(expected[i] > expected[j]) for i, j in rows)
-    return replace(averaged, quality=replace(chosen.quality, pairs_satisfied=satisfied))
 
 
 def _grid(dimensions: int, rng: np.random.Generator) -> np.ndarray:
