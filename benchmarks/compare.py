@@ -45,8 +45,8 @@ class Study:
                     seed = rows.setdefault(int(row["seed"]), {})
                     seed[int(row["iteration"])] = int(row["answers"]), float(row["value"])
         self.seeds = sorted(rows)
-        shared = min(map(len, rows.values()))
-        kept = [[rows[seed][iteration] for iteration in sorted(rows[seed])[:shared]] for seed in self.seeds]
+        common = min(map(len, rows.values()))
+        kept = [[rows[seed][iteration] for iteration in sorted(rows[seed])[:common]] for seed in self.seeds]
         answers = np.array([[answers for answers, _ in trial] for trial in kept])
         self.by_iteration = np.array([[value for _, value in trial] for trial in kept])
         self.used = answers[:, -1]
@@ -56,9 +56,11 @@ class Study:
         """The value of each trial once so many answers are in; its last where it gave fewer."""
         return self.values[:, np.flatnonzero(self.answers <= answers)[-1]]
 
-    def of(self, seeds: list[int]) -> np.ndarray:
-        """The rows of these seeds."""
-        return np.array([self.seeds.index(seed) for seed in seeds])
+
+def shared(*studies: Study) -> list[list[int]]:
+    """For each study the rows of the seeds that all of them have, in one order."""
+    seeds = sorted(set.intersection(*(set(study.seeds) for study in studies)))
+    return [[study.seeds.index(seed) for seed in seeds] for study in studies]
 
 
 def resampled(number: int) -> np.ndarray:
@@ -96,28 +98,29 @@ def share_of_answers(study: Study, reference: Study, value: float) -> str:
 
     Where the study's is never there the share is 0, and where the reference's is not there is none.
     """
-    seeds = [seed for seed in study.seeds if seed in reference.seeds]
-    if not seeds:
+    rows, of_reference = shared(study, reference)
+    if not rows:
         return "–"
-    shares = []
-    for chosen in (np.arange(len(seeds)), resampled(len(seeds))):
-        needed, by_reference = (
-            first(one.answers, one.values[one.of(seeds)[chosen]], value, 0.25) for one in (study, reference)
-        )
+    values, before = study.values[rows], reference.values[of_reference]
+
+    def share(values: np.ndarray, before: np.ndarray) -> np.ndarray:
+        needed = first(study.answers, values, value, 0.25)
+        by_reference = first(reference.answers, before, value, 0.25)
         with np.errstate(invalid="ignore"):  # where neither is ever there
-            shares.append(np.where(np.isfinite(by_reference), by_reference / needed, np.inf))
-    low, high = np.quantile(shares[1], [0.025, 0.975], method="inverted_cdf")
-    return f"{shares[0]:.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(shares[0]) else "–"
+            return np.where(np.isfinite(by_reference), by_reference / needed, np.inf)
+
+    found, chosen = share(values, before), resampled(len(rows))
+    low, high = np.quantile(share(values[chosen], before[chosen]), [0.025, 0.975], method="inverted_cdf")
+    return f"{found:.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(found) else "–"
 
 
 def paired(study: Study, reference: Study, answers: float) -> str:
     """The median difference after so many answers, over the seeds of both, with its bootstrap interval."""
-    seeds = [seed for seed in study.seeds if seed in reference.seeds]
-    if not seeds or answers < max(study.answers[0], reference.answers[0]):
+    rows, of_reference = shared(study, reference)
+    if not rows or answers < max(study.answers[0], reference.answers[0]):
         return "–"
-    value, before = (one.at(answers)[one.of(seeds)] for one in (study, reference))
-    differences = value - before
-    low, high = np.quantile(np.median(differences[resampled(len(seeds))], axis=1), [0.025, 0.975])
+    differences = study.at(answers)[rows] - reference.at(answers)[of_reference]
+    low, high = np.quantile(np.median(differences[resampled(len(rows))], axis=1), [0.025, 0.975])
     return f"{np.median(differences):+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
