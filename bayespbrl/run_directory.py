@@ -154,11 +154,12 @@ class RunDirectory:
         Raises:
           ValueError: iterations are missing from the log.
         """
-        if known <= state.iteration + 1 or any(event["event"] == "undone" for event in list(self._events())[-1:]):
-            return
-        raise ValueError(
-            f"events.jsonl: expected the {known} completed iterations that summary.json tells of, got {state.iteration}"
-        )
+        undone = [event["event"] for event in self._events()][-1:] == ["undone"]
+        if known > state.iteration + 1 and not undone:
+            raise ValueError(
+                f"events.jsonl: expected the {known} completed iterations that summary.json tells of, "
+                f"got {state.iteration}"
+            )
 
     def drop_partial_line(self) -> None:
         """Cut off a last line that a killed process left half-written, so that the next event starts a new one."""

@@ -166,6 +166,11 @@ class Settings:
                 raise ValueError(f"{name}: expected at most {limit} with {limit} candidates, got {getattr(self, name)}")
 
     @property
+    def own_parts(self) -> tuple[str, ...]:
+        """What of the run was an object of the user's, which has to be passed again to go on, or its expert."""
+        return tuple(name for name in CHOICES if getattr(self, name) == "other")
+
+    @property
     def psi_discount(self) -> float:
         """γ of ψ(τ), by which answers are explained."""
         return self.discount if self.trajectory_discount is None else self.trajectory_discount

@@ -112,8 +112,7 @@ def _state(evidence: Evidence) -> str:
         return f"Finished: {done} iterations."
     waiting = "" if evidence.waiting is None else f" Question {evidence.waiting} waits for an answer."
     text = f"In progress: {done} of {wanted} iterations.{waiting} "
-    parts = ("expert", "features", "policy", "schedule", "environment")
-    if any(getattr(evidence.settings, part) == "other" for part in parts):
+    if evidence.settings.own_parts:
         return text + f"bayespbrl.resume({str(evidence.path)!r}) goes on in Python, given what was the user's own."
     return text + f"bayespbrl resume {evidence.path} goes on."
 

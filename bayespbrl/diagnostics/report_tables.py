@@ -155,17 +155,14 @@ def trajectories_table(evidence: Evidence) -> xr.Dataset:
     Raises:
       ValueError: no estimate, or features that were not passed again.
     """
-    if not hasattr(evidence.estimate, "trajectory_utilities"):
-        raise ValueError("utility: expected an estimate, got none")
+    estimate = _estimate(evidence)
     asked = {number for record in evidence.answers for number in (record.first, record.second)}
     numbers = sorted(asked & set(evidence.trajectories))
     shown = [evidence.trajectories[number] for number in numbers]
     data: dict[str, Any] = {"hidden_return": ("trajectory", np.array([t.total_reward for t in shown]))}
-    data["utility"] = ("trajectory", evidence.estimate.trajectory_utilities(shown) if shown else np.zeros(0))
+    data["utility"] = ("trajectory", estimate.trajectory_utilities(shown) if shown else np.zeros(0))
     if evidence.posterior is not None and shown:
-        draws = return_draws(evidence.estimate, shown, number=DRAWS)["returns"]
-        for name, level in (("lower", 0.05), ("upper", 0.95)):
-            data[name] = ("trajectory", draws.quantile(level, dim=("chain", "draw")).values)
+        data |= _interval(estimate.trajectory_draws(shown, number=DRAWS), "trajectory")
     return xr.Dataset(data, coords={"trajectory": numbers})
 
 
@@ -180,26 +177,18 @@ def progress_table(evidence: Evidence) -> xr.Dataset:
     Raises:
       ValueError: no estimate; features that were not passed again.
     """
-    if not hasattr(evidence.estimate, "trajectory_utilities"):
-        raise ValueError("utility: expected an estimate, got none")
-    size = evidence.settings.trajectories_per_iteration
-    first = range(0, max(evidence.trajectories, default=-1) + 1, size)
-    batches = [range(n, n + size) for n in first if all(i in evidence.trajectories for i in range(n, n + size))]
-    shown = [evidence.trajectories[n] for batch in batches for n in batch]
-    iterations = [batch[0] // size + 1 for batch in batches]
-    if not shown:
-        return xr.Dataset({"utility": ("iteration", np.zeros(0))}, coords={"iteration": iterations})
+    estimate, size = _estimate(evidence), evidence.settings.trajectories_per_iteration
+    numbers = sorted(evidence.trajectories)  # of whole iterations, for the file of one is read or is not
+    shown = [evidence.trajectories[number] for number in numbers]
 
     def over_the_last(utilities: np.ndarray) -> np.ndarray:
         means = utilities.reshape(*utilities.shape[:-1], -1, size).mean(axis=-1)
         return means - means[..., -1:]
 
-    data = {"utility": ("iteration", over_the_last(evidence.estimate.trajectory_utilities(shown)))}
+    data: dict[str, Any] = {"utility": ("iteration", over_the_last(estimate.trajectory_utilities(shown)))}
     if evidence.posterior is not None:
-        draws = over_the_last(evidence.estimate.trajectory_draws(shown, number=DRAWS))
-        for name, level in (("lower", 0.05), ("upper", 0.95)):
-            data[name] = ("iteration", np.quantile(draws, level, axis=0))
-    return xr.Dataset(data, coords={"iteration": iterations})
+        data |= _interval(over_the_last(estimate.trajectory_draws(shown, number=DRAWS)), "iteration")
+    return xr.Dataset(data, coords={"iteration": [number // size + 1 for number in numbers[::size]]})
 
 
 def ranking_table(evidence: Evidence) -> xr.Dataset:
@@ -215,6 +204,19 @@ def ranking_table(evidence: Evidence) -> xr.Dataset:
         return xr.Dataset(coords={"trajectory": np.zeros(0, dtype=np.int64)})
     draws = return_draws(evidence.estimate, [evidence.trajectories[n] for n in numbers], number=DRAWS)
     return ranking_probabilities(draws.assign_coords(trajectory=numbers))
+
+
+def _estimate(evidence: Evidence) -> Any:
+    """The estimate of a run that has one; a `ValueError` otherwise."""
+    if not hasattr(evidence.estimate, "trajectory_utilities"):
+        raise ValueError("utility: expected an estimate, got none")
+    return evidence.estimate
+
+
+def _interval(draws: np.ndarray, dimension: str) -> dict[str, Any]:
+    """`lower` and `upper`, the ends of the interval that holds 90 % of the draws, (S, n), along `dimension`."""
+    lower, upper = np.quantile(draws, [0.05, 0.95], axis=0)
+    return {"lower": (dimension, lower), "upper": (dimension, upper)}
 
 
 def _states_to_show(

@@ -183,7 +183,10 @@ def _mending(text: str) -> str:
     if "last line is cut off" in text:
         return "If nothing else is broken, nothing to do: bayespbrl resume drops the rest of a line and goes on."
     if text.startswith("events.jsonl holds"):
-        return "The figures of summary.json are used. Bring the log back from a copy; without it the run cannot go on."
+        return (
+            "The figures of summary.json are used. Where an interruption does not explain it, bring the log back from "
+            "a copy: without it the run cannot go on."
+        )
     if "environment" in text:
         return "Register it first, or call bayespbrl.load(directory, env=...).report() with the object."
     return "What the log says up to there is used. Bring the file back from a copy to go on with the run."
