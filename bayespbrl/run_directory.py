@@ -154,8 +154,9 @@ class RunDirectory:
         Raises:
           ValueError: iterations are missing from the log.
         """
-        undone = [event["event"] for event in self._events()][-1:] == ["undone"]
-        if known > state.iteration + 1 and not undone:
+        if known <= state.iteration + 1:
+            return
+        if [event["event"] for event in self._events()][-1:] != ["undone"]:
             raise ValueError(
                 f"events.jsonl: expected the {known} completed iterations that summary.json tells of, "
                 f"got {state.iteration}"
