@@ -1,11 +1,10 @@
 """Frozen dataclasses of arrays and numbers as xarray trees, and back: how policies, features and estimates are stored.
 
 Arrays become variables, everything else becomes one JSON attribute, dataclasses within become groups. No pickle: what
-is read back are arrays and numbers, put into a class that is ours or that the caller named.
+is read back are arrays and numbers, put into a class that `STORED` names or that the caller passed.
 """
 
 import dataclasses
-import importlib
 import json
 from collections.abc import Iterable
 from typing import Any
@@ -14,7 +13,25 @@ import jax
 import numpy as np
 import xarray as xr
 
-OURS = "bayespbrl."
+from bayespbrl.features import JointRadialBasis, OneHot, RadialBasis, StateActionProduct
+from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, TabularPolicy
+from bayespbrl.utility import FitQuality, KnownReward
+
+# The names by which files know our classes. A name never changes; the class behind it may move.
+STORED: dict[str, type] = {
+    "fit-quality": FitQuality,
+    "gaussian-process": GaussianProcessPolicy,
+    "joint-radial-basis": JointRadialBasis,
+    "known-reward": KnownReward,
+    "linear-gaussian": LinearGaussianPolicy,
+    "one-hot": OneHot,
+    "radial-basis": RadialBasis,
+    "softmax": SoftmaxPolicy,
+    "state-action-product": StateActionProduct,
+    "tabular": TabularPolicy,
+}
+NAMES = {kind: name for name, kind in STORED.items()}
+OWN = "own:"  # stands before the name of a class of the user's
 
 
 def to_tree(record: Any) -> xr.DataTree:
@@ -38,7 +55,7 @@ def to_tree(record: Any) -> xr.DataTree:
         else:
             kind = type(value).__name__
             raise ValueError(f"record: {type(record).__name__}.{field.name} is a {kind}, which cannot be stored")
-    attributes = {"class": f"{type(record).__module__}:{type(record).__qualname__}", "fields": json.dumps(plain)}
+    attributes = {"class": stored_name(type(record)), "fields": json.dumps(plain)}
     return xr.DataTree(xr.Dataset(arrays, attrs=attributes), children=children)
 
 
@@ -65,17 +82,15 @@ def from_tree(tree: xr.DataTree, *, known: Iterable[type] = ()) -> Any:
         raise ValueError(f"record: stored {kind.__name__} does not fit this version's ({error})") from error
 
 
+def stored_name(kind: type) -> str:
+    """The name by which files know a class: ours by `STORED`, the user's by its own name."""
+    return NAMES.get(kind, OWN + kind.__qualname__)
+
+
 def _class(name: str, known: tuple[type, ...]) -> type:
     for candidate in known:
-        if name == f"{candidate.__module__}:{candidate.__qualname__}":
+        if name == stored_name(candidate):
             return candidate
-    module, _, qualified = name.partition(":")
-    if not module.startswith(OURS):
-        raise ValueError(f"record: expected a class of {OURS[:-1]} or one that was passed again, got {name!r}")
-    try:
-        kind = getattr(importlib.import_module(module), qualified)
-    except (ImportError, AttributeError):
-        raise ValueError(f"record: expected a class of this version, got {name!r}") from None
-    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        raise ValueError(f"record: expected a dataclass, got {name!r}")
-    return kind
+    if name in STORED:
+        return STORED[name]
+    raise ValueError(f"record: expected a class of bayespbrl or one that was passed again, got {name!r}")

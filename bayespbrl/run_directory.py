@@ -21,7 +21,7 @@ from bayespbrl.events import Entry, LearnerState, surviving
 from bayespbrl.iteration_files import read_iteration, write_iteration
 from bayespbrl.settings import Settings
 
-FORMAT = 1
+FORMAT = 2  # 1 named classes by their modules
 
 
 class RunDirectory:
@@ -72,7 +72,12 @@ class RunDirectory:
         if not isinstance(content, dict) or not isinstance(content.get("format"), int):
             raise ValueError(f"{file}: expected the settings of a run, got a foreign file")
         if content["format"] > FORMAT:
-            raise ValueError(f"{file}: expected format {FORMAT} or older, got {content['format']} of a newer version")
+            raise ValueError(f"{file}: expected format {FORMAT}, got {content['format']} of a newer version")
+        if content["format"] < FORMAT:
+            raise ValueError(
+                f"{file}: expected format {FORMAT}, got {content['format']}: read it with the version that wrote it, "
+                f"{content.get('version', 'an older one')}"
+            )
         names = {field.name for field in fields(Settings)}
         try:
             return cls(path, Settings(**{name: value for name, value in content.items() if name in names}))

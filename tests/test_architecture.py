@@ -65,7 +65,7 @@ ALLOWED = {
     "evidence and averaging": [*FLOWS, "steps"],
     "schedules": [*FLOWS, "steps", "diagnostics"],
     "plain data": [],
-    "memory": [],
+    "memory": [*FLOWS, "steps"],
     "events": ["what flows round"],
     "cycle": [*FLOWS, "steps", "evidence and averaging", "schedules", "plain data", "events"],
     "run directory": [*FLOWS, "steps", "evidence and averaging", "plain data", "memory", "events"],

@@ -80,7 +80,7 @@ def test_a_run_directory_holds_what_it_should(finished):
     assert {path.name for path in finished.iterdir()} == FILES
     assert {path.name for path in (finished / "iterations").iterdir()} == {"0001.nc", "0002.nc", "0003.nc"}
     settings = json.loads((finished / "settings.json").read_text())
-    assert settings["format"] == 1
+    assert settings["format"] == 2
     assert settings["version"] == "0.1.0"
     assert {name: settings[name] for name in QUICK} == QUICK
     assert settings["env"] == "gridworld"
@@ -477,11 +477,11 @@ def test_an_event_that_could_not_be_kept_is_taken_back_and_can_be_tried_again(tm
 SETTINGS = {
     "missing": None,
     "empty": "",
-    "no JSON": "{format: 1}",
+    "no JSON": "{format: 2}",
     "foreign": '{"name": "package", "version": "1.0"}',
     "a list": "[1, 2]",
-    "bad value": '{"format": 1, "env": "gridworld", "kl_bound": -1}',
-    "no environment": '{"format": 1}',
+    "bad value": '{"format": 2, "env": "gridworld", "kl_bound": -1}',
+    "no environment": '{"format": 2}',
     "not text": b"\xff\xfe\x00\x01",
 }
 
@@ -503,8 +503,11 @@ def test_a_directory_without_the_settings_of_a_run_is_refused(copy, content):
 
 def test_a_newer_format_is_refused_by_name(copy):
     settings = json.loads((copy / "settings.json").read_text())
-    (copy / "settings.json").write_text(json.dumps(settings | {"format": 2}))
-    with pytest.raises(ValueError, match=r"settings\.json: expected format 1 or older, got 2 of a newer version"):
+    (copy / "settings.json").write_text(json.dumps(settings | {"format": 3}))
+    with pytest.raises(ValueError, match=r"settings\.json: expected format 2, got 3 of a newer version"):
+        bayespbrl.load(copy)
+    (copy / "settings.json").write_text(json.dumps(settings | {"format": 1}))
+    with pytest.raises(ValueError, match=r"settings\.json: expected format 2, got 1: read it with the version"):
         bayespbrl.load(copy)
 
 
