@@ -1,12 +1,12 @@
 """Probabilistic programming for preference-based reinforcement learning."""
 
-from bayespbrl.cycle import Learner
 from bayespbrl.experts import NoisyExpert, ReturnExpert, TerminalExpert
+from bayespbrl.learner import Learner
 from bayespbrl.preferences import Answer, Preferences, Query
-from bayespbrl.runs import Run, load, resume, start
+from bayespbrl.runs.run import Run, load, resume, start
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility import infer_utility
+from bayespbrl.utility.estimate import infer_utility
 
 __all__ = [
     "Answer",

@@ -1,5 +1,5 @@
 """`python -m bayespbrl` is `bayespbrl`."""
 
-from bayespbrl.cli import main
+from bayespbrl.cli.commands import main
 
 main()

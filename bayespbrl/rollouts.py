@@ -21,7 +21,7 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from bayespbrl.envs import functional
-from bayespbrl.envs.opening import environment_name, open_environment, told
+from bayespbrl.envs.opening import environment_attribute, environment_name, open_environment
 from bayespbrl.envs.stepping import episodes_by_interface
 from bayespbrl.trajectories import Trajectory
 
@@ -114,7 +114,7 @@ def step_limit(environment: Any, max_steps: int | None = None) -> int:
         return int(max_steps)
     limits: list[Any] = [layer._max_episode_steps for layer in _layers(env) if isinstance(layer, TimeLimit)]
     limits.append(env.spec.max_episode_steps if env.spec is not None else None)
-    limits.append(told(env, "max_episode_steps"))
+    limits.append(environment_attribute(env, "max_episode_steps"))
     for limit in limits:
         if limit is not None:
             return int(limit)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayespbrl.trial_tables import by_answers
+from bayespbrl.studies.tables import by_answers
 
 COLUMNS = (6, 8, 10, 15, 20, 30)
 REACHED = 0.95

@@ -22,8 +22,10 @@ from typing import Any
 
 import jax
 
-from bayespbrl import Learner, ReturnExpert, evidence, features, lstd, models, policies, reps, rollouts, trajectories
+from bayespbrl import Learner, ReturnExpert, features, models, policies, rollouts, trajectories
+from bayespbrl.improvement import lstd, reps
 from bayespbrl.policies import batch, hyperparameter_search
+from bayespbrl.utility import hyperparameters as evidence
 
 FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
     "features": (

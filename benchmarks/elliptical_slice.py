@@ -18,14 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayespbrl.diagnostics.convergence import convergence
 from bayespbrl.models import sample_posterior
+from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.likelihoods import Mixed, total_log_prob
 
 
 def report(margins: np.ndarray, seconds: float, compile_seconds: float) -> dict:
     """The named figures of one sampler; margins (chain, draw, K)."""
-    diagnosis = convergence(margins)
+    diagnosis = chain_convergence(margins)
     return {
         "draws": int(margins.shape[0] * margins.shape[1]),
         "seconds": seconds,
@@ -95,7 +95,7 @@ def theirs(
         margins = np.concatenate([margins, np.asarray(drawn)], axis=1)
         if chunk > check:
             check *= 2
-            if convergence(margins).effective_sample_size_min >= 100 or seconds > max_seconds:
+            if chain_convergence(margins).effective_sample_size_min >= 100 or seconds > max_seconds:
                 break
     return report(margins, seconds, max(first - seconds / chunk, 0.0))
 

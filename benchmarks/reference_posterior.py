@@ -15,8 +15,8 @@ import json
 import numpy as np
 from scipy.special import log_expit, logsumexp
 
-from bayespbrl.diagnostics.convergence import convergence
 from bayespbrl.models import sample_posterior
+from bayespbrl.models.convergence import chain_convergence
 
 
 def log_likelihood(margins: np.ndarray, *, steepness: float) -> np.ndarray:
@@ -87,7 +87,7 @@ def main() -> None:
     means, evidence = np.array([run[0] for run in runs]), np.array([run[1] for run in runs])
     tree = sample_posterior(differences, steepness=options.steepness, prior_scale=options.prior_scale, num_samples=4000)
     margins = np.asarray(tree["posterior/margins"])
-    ours = convergence(margins)
+    ours = chain_convergence(margins)
     error = np.hypot(means.std(axis=0, ddof=1) / np.sqrt(len(runs)), ours.monte_carlo_error)
     distance = np.abs(margins.mean(axis=(0, 1)) - means.mean(axis=0)) / np.where(error > 0, error, 1.0)
     print(

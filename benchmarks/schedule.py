@@ -12,7 +12,8 @@ import json
 import time
 from typing import Any
 
-from bayespbrl import Learner, ReturnExpert, schedules
+from bayespbrl import Learner, ReturnExpert
+from bayespbrl.improvement import schedules
 
 
 class Twice(Learner):

@@ -1,9 +1,7 @@
-"""The import rule of the house, read from the imports themselves."""
+"""The plan of the house, read from the source: who may import whom, and how large a room may be."""
 
 import ast
 from pathlib import Path
-
-import pytest
 
 import bayespbrl
 
@@ -13,95 +11,68 @@ MODULES = {
     for path in sorted(ROOT.rglob("*.py"))
 }
 
-# Groups of modules, and the groups that each may import: a name in the table is a module, or a package with all in it
-# that no other group names.
-GROUPS = {
-    "numerics": ["kernels", "lstd", "reps"],
-    "convergence": ["diagnostics.convergence"],
+# The floors of the house from the ground up, and the rooms on each: modules, or packages with all in them that no other
+# floor names. A module imports from its own floor and from those that its floor names.
+ROOMS = {
+    "numerics": ["kernels"],
     "environments": ["envs"],
     "models": ["models"],
     "policies": ["policies"],
     "what flows round": ["trajectories", "features", "preferences", "experts"],
-    "critic": ["q_function"],
-    "steps": ["utility", "improvement", "rollouts", "queries"],
-    "evidence and averaging": ["evidence", "averaging"],
-    "schedules": ["schedules"],
-    "plain data": ["settings"],
-    "memory": ["records"],
+    "estimate": ["utility.estimate"],
+    "step 1": ["utility"],
+    "step 2": ["improvement"],
+    "step 3": ["rollouts"],
+    "step 4": ["queries"],
+    "settings": ["settings"],
     "events": ["events"],
-    "cycle": ["cycle"],
-    "run directory": ["run_directory", "iteration_files"],
+    "learner": ["learner"],
     "runs": ["runs"],
+    "studies": ["studies"],
     "diagnostics": ["diagnostics"],
     "report": ["diagnostics.report"],
-    "trials": ["trials", "trial_tables"],
-    "film": ["film"],
-    "command line": ["cli", "screen", "__main__"],
+    "command line": ["cli", "__main__"],
 }
-GROUND = ["numerics", "convergence", "environments"]
-FLOWS = [*GROUND, "models", "policies", "what flows round"]
-LEARNED = [
-    *FLOWS,
-    "critic",
-    "steps",
-    "evidence and averaging",
-    "schedules",
-    "plain data",
-    "memory",
-    "events",
-    "cycle",
-    "run directory",
-    "runs",
-]
-ALLOWED = {
+STEPS = ["step 1", "step 2", "step 3", "step 4"]
+FLOWS = ["numerics", "environments", "models", "policies", "what flows round", "estimate"]
+LEARNED = [*FLOWS, *STEPS, "settings", "events", "learner"]
+BELOW = {
     "numerics": [],
-    "convergence": [],
-    "environments": [],
-    "models": ["numerics", "convergence"],
+    "environments": ["numerics"],
+    "models": ["numerics"],
     "policies": ["numerics"],
     "what flows round": ["numerics"],
-    "critic": FLOWS,
-    "steps": [*FLOWS, "critic"],
-    "evidence and averaging": [*FLOWS, "steps"],
-    "schedules": [*FLOWS, "steps", "diagnostics"],
-    "plain data": [],
-    "memory": [*FLOWS, "steps"],
-    "events": ["what flows round"],
-    "cycle": [*FLOWS, "steps", "evidence and averaging", "schedules", "plain data", "events"],
-    "run directory": [*FLOWS, "steps", "evidence and averaging", "plain data", "memory", "events"],
-    "runs": [*LEARNED, "report"],  # `Run.report` calls it, and imports it when called
-    "diagnostics": [*LEARNED, "trials"],
-    "report": [*LEARNED, "diagnostics", "trials"],
-    "trials": LEARNED,
-    "film": LEARNED,
-    "command line": [*LEARNED, "diagnostics", "report", "trials", "film"],
+    "estimate": ["models", "what flows round"],
+    **dict.fromkeys(STEPS, FLOWS),
+    "settings": [*FLOWS, *STEPS],
+    "events": [*FLOWS, *STEPS, "settings"],
+    "learner": LEARNED,
+    "runs": LEARNED,
+    "studies": [*LEARNED, "runs"],
+    "diagnostics": LEARNED,
+    "report": [*LEARNED, "runs", "diagnostics"],
+    "command line": [*LEARNED, "runs", "studies", "diagnostics", "report"],
 }
-# These import each other.
-WITHIN = {
-    "evidence and averaging",
-    "environments",
-    "models",
-    "policies",
-    "what flows round",
-    "run directory",
-    "diagnostics",
-    "trials",
-    "command line",
-}
+# `Run.report` imports the report, which stands above it, when it is called.
+DOORS = {("runs.run", "diagnostics.report")}
 
 
-def group_of(module):
-    """The group of the longest name in the table that `module` is, or lies in; None for the package itself."""
+def floor_of(module):
+    """The floor of the longest name in the table that `module` is, or lies in; None for the package itself."""
     matches = [
-        (len(name), group) for group, names in GROUPS.items() for name in names if (module + ".").startswith(name + ".")
+        (len(name), floor) for floor, names in ROOMS.items() for name in names if (module + ".").startswith(name + ".")
     ]
     return max(matches)[1] if matches else None
 
 
+def tree_of(module):
+    return ast.parse(MODULES[module].read_text())
+
+
 def imports(module):
-    """Names of all modules that a module imports anywhere in it, and of ours without the package's name."""
+    """Names of all modules that a module imports anywhere in it."""
     names = set()
-    for node in ast.walk(ast.parse(MODULES[module].read_text())):
+    for node in ast.walk(tree_of(module)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -111,6 +82,7 @@ def imports(module):
 
 
 def ours(module):
+    """Those of this package, without its name."""
     found = set()
     for name in imports(module):
         if name.split(".")[0] != "bayespbrl":
@@ -122,47 +94,54 @@ def ours(module):
     return found - {module}
 
 
-INNER = sorted(set(MODULES) - {"__init__"})
+def permitted(module, other):
+    its_floor = floor_of(other)
+    return its_floor == floor_of(module) or its_floor in BELOW[floor_of(module)] or (module, other) in DOORS
 
 
-def test_every_module_belongs_to_one_group():
-    assert [module for module in INNER if group_of(module) is None] == []
-    assert set(ALLOWED) == set(GROUPS)
+INNER = sorted(set(MODULES) - {"", "__init__"})
 
 
-@pytest.mark.parametrize("module", INNER)
-def test_a_module_imports_only_what_its_group_may(module):
-    group = group_of(module)
-    for other in sorted(ours(module)):
-        assert other, f"{module} imports the package itself, which imports everything"
-        its_group = group_of(other)
-        inside = its_group == group and (group in WITHIN)
-        permitted = inside or its_group in ALLOWED[group]
-        assert permitted, f"{module} ({group}) imports {other} ({its_group})"
+def test_every_module_belongs_to_one_floor():
+    assert [module for module in INNER if floor_of(module) is None] == []
+    assert set(BELOW) == set(ROOMS)
 
 
-def test_the_steps_never_import_each_other():
-    steps = set(GROUPS["steps"])
-    assert {module: ours(module) & steps for module in steps} == {module: set() for module in steps}
+def test_a_module_imports_only_what_its_floor_may():
+    assert [
+        f"{module} ({floor_of(module)}) imports {other} ({floor_of(other)})"
+        for module in INNER
+        for other in sorted(ours(module))
+        if not other or not permitted(module, other)
+    ] == []
 
 
-def test_only_the_cycle_and_what_stands_above_it_import_the_steps_together():
-    together = {module for module in INNER if len(ours(module) & set(GROUPS["steps"])) == len(GROUPS["steps"])}
-    assert together == {"cycle"}
+def test_no_imports_go_round_in_circles():
+    below = {module: {other for other in ours(module) if (module, other) not in DOORS} for module in INNER}
+    left = dict(below)
+    while free := [module for module, others in left.items() if not others & set(left)]:
+        for module in free:
+            del left[module]
+    assert left == {}
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_nothing_imports_through_the_links_at_the_top_level(module):
-    assert {name.split(".")[0] for name in imports(module)}.isdisjoint({"models", "diagnostics", "envs"})
+def test_the_steps_never_import_each_other_and_only_the_learner_orders_them():
+    steps = {module: {floor_of(other) for other in ours(module)} & set(STEPS) for module in INNER}
+    assert {
+        module for module, others in steps.items() if floor_of(module) in STEPS and others - {floor_of(module)}
+    } == set()
+    assert {module for module, others in steps.items() if others == set(STEPS)} <= {"learner", "settings"}
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_a_modules_first_line_says_what_it_is(module):
-    text = ast.get_docstring(ast.parse(MODULES[module].read_text()))
-    assert text, f"{module} has no docstring"
-    first = text.splitlines()[0]
-    assert 10 < len(first) <= 117
-    assert MODULES[module].read_text().startswith('"""')
+def test_nothing_imports_through_the_links_at_the_top_level():
+    assert [m for m in MODULES if {n.split(".")[0] for n in imports(m)} & {"models", "diagnostics", "envs"}] == []
+
+
+def test_a_modules_first_line_says_what_it_is():
+    for module, path in MODULES.items():
+        text = ast.get_docstring(tree_of(module)) or ""
+        assert 10 < len(text.partition("\n")[0]) <= 117, module
+        assert path.read_text().startswith('"""'), module
 
 
 def test_the_links_at_the_top_level_lead_into_the_package():
@@ -173,9 +152,11 @@ def test_the_links_at_the_top_level_lead_into_the_package():
 
 
 def test_the_rule_refuses_what_it_should():
-    assert group_of("diagnostics.convergence") == "convergence"
-    assert group_of("diagnostics.plots") == "diagnostics"
-    assert group_of("envs.gridworld") == "environments"
-    assert group_of("environment") is None
-    assert "steps" not in ALLOWED["steps"]
-    assert {"trajectories", "q_function", "reps"} <= ours("improvement")
+    assert floor_of("diagnostics.report.tables") == "report"
+    assert floor_of("diagnostics.plots") == "diagnostics"
+    assert floor_of("envs.gridworld") == "environments"
+    assert floor_of("environment") is None
+    assert not permitted("utility.averaging", "improvement.reps")
+    assert not permitted("models.posterior", "utility.estimate")
+    assert permitted("learner", "utility.averaging")
+    assert {"trajectories", "improvement.q_function", "improvement.reps"} <= ours("improvement.update")

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from bayespbrl import Learner, ReturnExpert, cycle, queries
-from bayespbrl.averaging import BANDWIDTH_MULTIPLES, MOST_BANDWIDTHS, average_utility
-from bayespbrl.evidence import STEEPNESS_MULTIPLES, choose_hyperparameters
+from bayespbrl import Learner, ReturnExpert, queries
+from bayespbrl import learner as cycle
 from bayespbrl.features import OneHot, RadialBasis
-from bayespbrl.iteration_files import read_iteration
-from bayespbrl.runs import start
+from bayespbrl.runs.iteration_files import read_iteration
+from bayespbrl.runs.run import start
 from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility import LinearUtility, estimate_utility
+from bayespbrl.utility.averaging import BANDWIDTH_MULTIPLES, MOST_BANDWIDTHS, average_utility
+from bayespbrl.utility.estimate import LinearUtility, estimate_utility
+from bayespbrl.utility.hyperparameters import STEEPNESS_MULTIPLES, choose_hyperparameters
 
 LINE = RadialBasis(np.linspace(-1, 1, 5)[:, None], np.array([0.4]), np.array([np.inf]), normalised=True)
 PAIRS = [(0, 1), (0, 2), (3, 2)]

@@ -7,8 +7,9 @@ import pytest
 from gymnasium.spaces import Box, Discrete, MultiDiscrete, Tuple
 
 import bayespbrl
-from bayespbrl import ReturnExpert, runs
+from bayespbrl import ReturnExpert
 from bayespbrl.policies import LinearGaussianPolicy
+from bayespbrl.runs import run as runs
 
 STEPS = 5
 QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": STEPS, "evaluation_episodes": 4, "centres": 20}

@@ -11,10 +11,10 @@ import pytest
 import xarray as xr
 
 import bayespbrl
-from bayespbrl.cli import main
+from bayespbrl.cli.commands import main
+from bayespbrl.cli.display import print_trials
 from bayespbrl.experts import simulated_expert
-from bayespbrl.screen import print_trials
-from bayespbrl.trials import Trials
+from bayespbrl.studies.trials import Trials
 
 QUICK = ["--utility", "linear-program", "--iterations", "2"]
 

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from bayespbrl.diagnostics.convergence import convergence
+from bayespbrl.models.convergence import chain_convergence
 
 
 def test_independent_draws_are_worth_themselves():
-    report = convergence(np.random.default_rng(0).standard_normal((4, 1000, 3)))
+    report = chain_convergence(np.random.default_rng(0).standard_normal((4, 1000, 3)))
     assert report.converged()
     np.testing.assert_allclose(report.effective_sample_size, 4000, rtol=0.1)
     np.testing.assert_allclose(report.monte_carlo_error, 1 / np.sqrt(4000), rtol=0.1)
@@ -18,13 +18,13 @@ def test_an_autoregressive_chain_is_worth_its_known_share():
     draws[:, 0] = rng.standard_normal(4)
     for i in range(1, 5000):
         draws[:, i] = rho * draws[:, i - 1] + np.sqrt(1 - rho**2) * rng.standard_normal(4)
-    assert convergence(draws).effective_sample_size_min == pytest.approx(20_000 * 0.2 / 1.8, rel=0.15)
+    assert chain_convergence(draws).effective_sample_size_min == pytest.approx(20_000 * 0.2 / 1.8, rel=0.15)
 
 
 def test_chains_in_different_places_have_not_converged():
     draws = np.random.default_rng(0).standard_normal((4, 500, 2))
     draws[0, :, 1] += 3
-    report = convergence(draws)
+    report = chain_convergence(draws)
     assert report.rhat[0] < 1.01 < 1.2 < report.rhat[1]
     assert not report.converged()
 
@@ -32,15 +32,15 @@ def test_chains_in_different_places_have_not_converged():
 def test_a_constant_needs_no_draws_and_nan_meets_no_limit():
     draws = np.random.default_rng(0).standard_normal((2, 2000, 2))
     draws[..., 1] = 0.0
-    assert convergence(draws).converged()
+    assert chain_convergence(draws).converged()
     draws[0, 7, 1] = np.nan
-    assert not convergence(draws).converged()
+    assert not chain_convergence(draws).converged()
 
 
 def test_nothing_to_estimate_has_converged():
-    assert convergence(np.zeros((4, 100, 0))).converged()
+    assert chain_convergence(np.zeros((4, 100, 0))).converged()
 
 
 def test_too_few_draws_are_named():
     with pytest.raises(ValueError, match="draws: expected shape"):
-        convergence(np.zeros(5))
+        chain_convergence(np.zeros(5))

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from bayespbrl import Answer, Learner, ReturnExpert, cycle, improvement, queries, rollouts
+from bayespbrl import Answer, Learner, ReturnExpert, queries, rollouts
+from bayespbrl import learner as cycle
 from bayespbrl.envs.gridworld import REWARDS
+from bayespbrl.improvement import update as improvement
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
 

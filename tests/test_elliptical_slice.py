@@ -8,8 +8,8 @@ from arviz_base import from_numpyro
 from numpyro.infer import MCMC, NUTS, Gibbs
 from scipy import stats
 
-from bayespbrl.diagnostics.convergence import convergence
 from bayespbrl.models import EllipticalSlice, preference_model
+from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.elliptical_slice import BATCHES_AHEAD, Ellipse, elliptical_moves
 from bayespbrl.models.likelihoods import Logistic, Mixed
 
@@ -61,7 +61,7 @@ def test_posterior_of_a_linear_regression_is_the_known_gaussian(reference):
     z = mcmc.get_samples(group_by_chain=True)
     draws = np.concatenate([z["offset"], z["slope"]], axis=2)
     mean, covariance = regression_posterior()
-    report = convergence(draws)
+    report = chain_convergence(draws)
     assert report.rhat_max < 1.02
     assert np.all(np.abs(draws.mean((0, 1)) - mean) < 4 * report.monte_carlo_error)
     np.testing.assert_allclose(np.cov(draws.reshape(-1, 3).T), covariance, atol=0.15 * covariance.max())
@@ -231,7 +231,7 @@ def test_ten_dimensions_agree_with_nuts_where_the_likelihood_is_smooth():
     ours = run(EllipticalSlice(preference_model, moves=8), *args, num_samples=4000)
     theirs = run(NUTS(preference_model), *args, num_warmup=500, num_samples=2000)
     a, b = (m.get_samples(group_by_chain=True)["margins"] for m in (ours, theirs))
-    error = np.hypot(convergence(a).monte_carlo_error, convergence(b).monte_carlo_error)
+    error = np.hypot(chain_convergence(a).monte_carlo_error, chain_convergence(b).monte_carlo_error)
     assert np.all(np.abs(a.mean((0, 1)) - b.mean((0, 1))) < 4.5 * error)
     np.testing.assert_allclose(a.std((0, 1)), b.std((0, 1)), rtol=0.1)
 
@@ -248,7 +248,7 @@ def test_ten_dimensions_agree_with_importance_sampling_under_the_discontinuous_l
     expected_error = np.sqrt(weights**2 @ (w - expected) ** 2)
     draws = run(EllipticalSlice(preference_model, moves=8), differences, likelihood, num_samples=4000)
     z = draws.get_samples(group_by_chain=True)["utility_weights"]
-    error = np.hypot(convergence(z).monte_carlo_error, expected_error)
+    error = np.hypot(chain_convergence(z).monte_carlo_error, expected_error)
     assert np.all(np.abs(z.mean((0, 1)) - expected) < 4.5 * error)
 
 
@@ -302,7 +302,7 @@ def test_scale_and_steepness_are_inferred_beside_w_by_gibbs_as_by_nuts_alone():
     alone = run(NUTS(hierarchical), differences, answers, num_warmup=500, num_samples=3000)
     for site in ("scale", "steepness", "w"):
         a, b = (m.get_samples(group_by_chain=True)[site] for m in (ours, alone))
-        error = np.hypot(convergence(a).monte_carlo_error, convergence(b).monte_carlo_error)
+        error = np.hypot(chain_convergence(a).monte_carlo_error, chain_convergence(b).monte_carlo_error)
         assert np.all(np.abs(a.mean((0, 1)) - b.mean((0, 1))) < 4.5 * error), site
 
 

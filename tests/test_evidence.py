@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from bayespbrl.evidence import choose_hyperparameters
 from bayespbrl.features import OneHot, RadialBasis
 from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility.hyperparameters import choose_hyperparameters
 
 
 def test_the_answers_choose_a_length_scale_in_each_dimension_of_the_state():

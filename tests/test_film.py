@@ -8,7 +8,7 @@ from PIL import Image
 
 from bayespbrl import Learner, ReturnExpert
 from bayespbrl.envs import pictures
-from bayespbrl.film import FRAMES, film_policy
+from bayespbrl.runs.film import FRAMES, film_policy
 
 QUICK = {"utility": "linear-program", "iterations": 1, "evaluation_episodes": 2, "seed": 3, "centres": 10}
 

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from bayespbrl import improvement, q_function
 from bayespbrl.features import OneHot, StateActionProduct, draw_state_action_features
+from bayespbrl.improvement import q_function
+from bayespbrl.improvement import update as improvement
 from bayespbrl.policies import (
     GaussianProcessPolicy,
     LinearGaussianPolicy,

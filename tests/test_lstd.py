@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bayespbrl.lstd import lstd_q, solve_lstd, transition_sums
+from bayespbrl.improvement.lstd import lstd_q, solve_lstd, transition_sums
 
 NO_PENALTY = {"fixed_point_ridge": 0.0, "projection_ridge": 0.0}
 

@@ -6,7 +6,6 @@ from numpyro.infer import MCMC
 from scipy import stats
 from scipy.special import logsumexp
 
-from bayespbrl.diagnostics.convergence import convergence
 from bayespbrl.models import (
     Candidate,
     posterior,
@@ -16,6 +15,7 @@ from bayespbrl.models import (
     select_hyperparameters,
     stored,
 )
+from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.likelihoods import Mixed, log_prob
 from bayespbrl.models.low_rank import low_rank
 from bayespbrl.models.posterior import _ellipses, _run, fit_gaussian
@@ -60,7 +60,7 @@ def test_answers_that_contradict_each_other_about_the_same_margin_are_sampled_ex
     tree = sample_posterior(differences, number_of_preferences=number, num_samples=2000, seed=1)
     margins = tree["posterior/margins"].values
     assert tree.attrs["converged"]
-    error = convergence(margins).monte_carlo_error
+    error = chain_convergence(margins).monte_carlo_error
     assert np.all(np.abs(margins.mean(axis=(0, 1)) - differences @ mean) < 4 * error)
 
 
@@ -94,7 +94,7 @@ def test_two_dimensions_agree_with_quadrature():
     log_p -= 0.5 * np.sum(w**2, axis=1) / 1.3**2
     p = np.exp(log_p - logsumexp(log_p))
     margins = tree["posterior/margins"].values
-    report = convergence(margins)
+    report = chain_convergence(margins)
     # half the grid's spacing for the sums across the jumps
     np.testing.assert_array_less(
         np.abs(margins.mean((0, 1)) - p @ (w @ differences.T)), 4.5 * report.monte_carlo_error + 2e-3
@@ -120,7 +120,7 @@ def test_duplicate_and_contradictory_answers_are_fine(likelihood):
     tree = sample_posterior(differences, likelihood=likelihood, lapse_rate=0.1)
     margin = tree["posterior/margins"].values[:, :, 0]
     np.testing.assert_allclose(tree["posterior/margins"].values[:, :, 3], -margin, atol=1e-12)
-    assert abs(margin.mean()) < 5 * convergence(margin[:, :, None]).monte_carlo_error[0]
+    assert abs(margin.mean()) < 5 * chain_convergence(margin[:, :, None]).monte_carlo_error[0]
     assert tree.attrs["converged"]
 
 
@@ -249,8 +249,8 @@ def test_chains_started_in_the_far_tail_forget_it():
         _, states, _ = _run(state, chains.problem, length=1000)
     margins = np.asarray(states.z["utility_weights"])[:, :, :20] @ fit.factors.loadings.T
     expected = sample_posterior(differences, num_samples=4000)["posterior/margins"].values
-    error = np.hypot(convergence(margins).monte_carlo_error, convergence(expected).monte_carlo_error)
-    assert convergence(margins).rhat_max < 1.02
+    error = np.hypot(chain_convergence(margins).monte_carlo_error, chain_convergence(expected).monte_carlo_error)
+    assert chain_convergence(margins).rhat_max < 1.02
     assert np.all(np.abs(margins.mean((0, 1)) - expected.mean((0, 1))) < 4.5 * error)
 
 

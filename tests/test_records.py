@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayespbrl import records
 from bayespbrl.features import OneHot, RadialBasis
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
-from bayespbrl.utility import FitQuality
+from bayespbrl.runs import stored_classes as records
+from bayespbrl.utility.estimate import FitQuality
 
 
 @dataclass(frozen=True)

@@ -18,19 +18,22 @@ from matplotlib.figure import Figure
 
 import bayespbrl
 from bayespbrl import ReturnExpert
-from bayespbrl.cli import main
-from bayespbrl.diagnostics import report_document, report_figures, report_tables, report_warnings
+from bayespbrl.cli.commands import main
 from bayespbrl.diagnostics.predictions import answer_probabilities
 from bayespbrl.diagnostics.prequential import score_predictions
-from bayespbrl.diagnostics.report import assembled, write_report
-from bayespbrl.diagnostics.report_answers import surprise_order
-from bayespbrl.diagnostics.report_evidence import read_evidence
-from bayespbrl.diagnostics.report_findings import figure
-from bayespbrl.iteration_files import read_iteration
+from bayespbrl.diagnostics.report import document as report_document
+from bayespbrl.diagnostics.report import figures as report_figures
+from bayespbrl.diagnostics.report import tables as report_tables
+from bayespbrl.diagnostics.report import warnings as report_warnings
+from bayespbrl.diagnostics.report.answers import surprise_order
+from bayespbrl.diagnostics.report.contents import read_evidence
+from bayespbrl.diagnostics.report.summary import figure
+from bayespbrl.diagnostics.report.write import assembled, write_report
+from bayespbrl.improvement.schedules import Bound
 from bayespbrl.models.likelihoods import log_prob
-from bayespbrl.schedules import Bound
+from bayespbrl.runs.iteration_files import read_iteration
 from bayespbrl.trajectories import trajectory_features
-from bayespbrl.utility import LinearUtility
+from bayespbrl.utility.estimate import LinearUtility
 
 QUICK = {"iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from bayespbrl import reps
-from bayespbrl.reps import advantages, reps_weights, reps_weights_by_state, whitened
+from bayespbrl.improvement import reps
+from bayespbrl.improvement.reps import advantages, reps_weights, reps_weights_by_state, whitened
 
 
 def random_problem(states=6, actions=3, seed=0):

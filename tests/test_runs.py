@@ -17,11 +17,13 @@ import pytest
 import xarray as xr
 
 import bayespbrl
-from bayespbrl import Learner, ReturnExpert, run_directory, runs
+from bayespbrl import Learner, ReturnExpert
 from bayespbrl.diagnostics.report import write_report
 from bayespbrl.envs.opening import given_by_name, open_environment
 from bayespbrl.policies import TabularPolicy
-from bayespbrl.run_directory import RunDirectory
+from bayespbrl.runs import directory as run_directory
+from bayespbrl.runs import run as runs
+from bayespbrl.runs.directory import RunDirectory
 from bayespbrl.settings import PRESETS
 
 QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
@@ -721,7 +723,8 @@ def test_a_run_without_any_pair_comes_back_with_its_posterior(tmp_path):
 
 VICTIM = """
 import json, sys
-from bayespbrl import ReturnExpert, runs
+from bayespbrl import ReturnExpert
+from bayespbrl.runs import run as runs
 
 directory, settings = sys.argv[1], json.loads(sys.argv[2])
 try:

@@ -7,8 +7,8 @@ import pytest
 
 from bayespbrl import Learner, load, resume, start
 from bayespbrl.experts import ReturnExpert
-from bayespbrl.improvement import ProposedUpdate
-from bayespbrl.schedules import LEAST_BOUND, Bound, ConfidenceBound, ConstantBound, Situation, decided
+from bayespbrl.improvement.schedules import LEAST_BOUND, Bound, ConfidenceBound, ConstantBound, Situation, decided
+from bayespbrl.improvement.update import ProposedUpdate
 
 NUMBER = 400
 

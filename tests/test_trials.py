@@ -15,10 +15,10 @@ import pytest
 import xarray as xr
 
 from bayespbrl import load, runs
-from bayespbrl import trials as trials_module
 from bayespbrl.rollouts import returns
-from bayespbrl.trial_tables import COLUMNS, collect
-from bayespbrl.trials import Trials, run_trials
+from bayespbrl.studies import trials as trials_module
+from bayespbrl.studies.tables import COLUMNS, collect
+from bayespbrl.studies.trials import Trials, run_trials
 
 QUICK = {"utility": "linear-program", "iterations": 2}
 
@@ -220,7 +220,7 @@ def test_bad_input_is_named_and_nothing_is_left(tmp_path, changes):
 def test_a_study_that_is_stopped_takes_its_trials_with_it(tmp_path, how):
     # where the tests run in the background interrupts are ignored, and would be here
     heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-c", f"{heard}; from bayespbrl.cli import main; main()", "trials", "gridworld"]
+    command = [sys.executable, "-c", f"{heard}; from bayespbrl.cli.commands import main; main()", "trials", "gridworld"]
     options = ["--utility", "linear-program", "--iterations", "100000", "--trials", "3", "--jobs", "2"]
     options += ["--out", str(tmp_path / "study")]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}

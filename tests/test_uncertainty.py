@@ -24,9 +24,9 @@ from bayespbrl.diagnostics.uncertainty import (
     thinned,
 )
 from bayespbrl.features import OneHot
-from bayespbrl.q_function import estimate_q
+from bayespbrl.improvement.q_function import estimate_q
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
-from bayespbrl.utility import estimate_utility
+from bayespbrl.utility.estimate import estimate_utility
 
 
 def staying(state, steps=4):

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from bayespbrl import utility
 from bayespbrl.features import OneHot
 from bayespbrl.models.likelihoods import Logistic, Mixed, WithLapses, log_prob
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
-from bayespbrl.utility import KnownReward, estimate_utility
+from bayespbrl.utility import estimate as utility
+from bayespbrl.utility.estimate import KnownReward, estimate_utility
 
 METHODS = ("posterior-mean", "most-likely", "posterior-draw", "linear-program")
 

@@ -6,7 +6,7 @@ from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from bayespbrl.diagnostics.convergence import convergence as convergence_of_draws
+from bayespbrl.models.convergence import chain_convergence
 
 
 def convergence(tree: xr.DataTree, *, rhat_max: float = 1.01, effective_sample_size_min: float = 400.0) -> xr.Dataset:
@@ -23,7 +23,7 @@ def convergence(tree: xr.DataTree, *, rhat_max: float = 1.01, effective_sample_s
     Source: Vehtari et al. (2021).
     """
     margins = np.asarray(tree["posterior"]["margins"])
-    report = convergence_of_draws(margins)
+    report = chain_convergence(margins)
     tail = np.full(margins.shape[2], float(margins.shape[0] * margins.shape[1]))
     varies = ~np.all(margins == margins[:1, :1], axis=(0, 1))
     if varies.any():
@@ -87,7 +87,7 @@ def plot_ranks(tree: xr.DataTree, axes: Axes, *, preference: int | None = None, 
     """
     margins = np.asarray(tree["posterior"]["margins"])
     if preference is None and margins.shape[2]:
-        preference = int(np.argmax(convergence_of_draws(margins).rhat))
+        preference = int(np.argmax(chain_convergence(margins).rhat))
     if preference is None or not 0 <= preference < margins.shape[2]:
         raise ValueError(f"preference: expected a number in 0 … {margins.shape[2] - 1}, got {preference}")
     draws = margins[:, :, preference]

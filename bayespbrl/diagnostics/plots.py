@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bayespbrl.cycle import Learner
-from bayespbrl.envs.opening import told
+from bayespbrl.envs.opening import environment_attribute
+from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Transitions, transitions
 
 
@@ -55,8 +55,8 @@ def trials_figure(quartiles: xr.Dataset, environment: Any, title: str) -> Figure
     """`quartile_curve` with the levels that the environment knows: its optimum, and returns published by others."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
-    levels = dict(told(environment, "published_returns") or {})
-    optimum = told(environment, "optimal_return")
+    levels = dict(environment_attribute(environment, "published_returns") or {})
+    optimum = environment_attribute(environment, "optimal_return")
     axes = quartile_curve(
         quartiles, figure.subplots(), levels=levels | ({} if optimum is None else {"optimal": optimum})
     )
@@ -72,7 +72,7 @@ def utility_beside_reward(learner: Learner, utility_axes: Axes, reward_axes: Axe
     """
     steps = transitions(learner.trajectories)
     utilities = learner.estimate.step_utilities(steps)
-    shape = told(learner.environment, "grid_shape")
+    shape = environment_attribute(learner.environment, "grid_shape")
     if shape is not None:
         draw = _map_of_cells
     elif steps.states.ndim == 2 and steps.states.shape[1] == 2:
@@ -93,7 +93,7 @@ def run_figure(learner: Learner) -> Figure:
     figure = Figure(figsize=(13, 4), layout="constrained")
     FigureCanvasAgg(figure)
     curve, utility, reward = figure.subplots(1, 3)
-    learning_curve(learner.iterations, curve, optimum=told(learner.environment, "optimal_return"))
+    learning_curve(learner.iterations, curve, optimum=environment_attribute(learner.environment, "optimal_return"))
     utility_beside_reward(learner, utility, reward)
     return figure
 

@@ -17,11 +17,11 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import rankdata
 
-from bayespbrl.averaging import AveragedUtility
-from bayespbrl.cycle import Learner
-from bayespbrl.q_function import QFunction, estimate_q
+from bayespbrl.improvement.q_function import QFunction, estimate_q
+from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Trajectory, transitions
-from bayespbrl.utility import spacing
+from bayespbrl.utility.averaging import AveragedUtility
+from bayespbrl.utility.estimate import spacing
 
 # Quantiles of the intervals in the figures: half and nine tenths of the draws.
 INTERVALS = ((0.25, 0.75, 4.0), (0.05, 0.95, 1.2))

@@ -82,7 +82,7 @@ def _same(first: Any, second: Any) -> bool:
         return False
 
 
-def told(env: gymnasium.Env, name: str) -> Any:
+def environment_attribute(env: gymnasium.Env, name: str) -> Any:
     """What an environment's pure functions tell beyond gymnasium, `optimal_return` or `grid_shape`; None if nothing."""
     return getattr(getattr(env.unwrapped, "dynamics", None), name, None)
 

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from bayespbrl.envs.functional import picture
-from bayespbrl.envs.opening import open_environment, told
+from bayespbrl.envs.opening import environment_attribute, open_environment
 
 MAX_FRAMES = 100
 
@@ -26,7 +26,7 @@ def draw_trajectory(environment: Any, trajectory: Any, axes: Any) -> Any:
       trajectory: has `states` (T+1, …), `actions` (T, …), `terminated` and a length.
       axes: matplotlib axes, of any figure.
     """
-    own = told(open_environment(environment), "draw_trajectory")
+    own = environment_attribute(open_environment(environment), "draw_trajectory")
     if own is not None:
         own(trajectory, axes)
         return axes
@@ -50,7 +50,7 @@ def frames(environment: Any, trajectory: Any, *, max_frames: int = MAX_FRAMES) -
     """
     if max_frames < 2:
         raise ValueError(f"max_frames: expected at least 2, got {max_frames}")
-    draw = told(open_environment(environment), "draw")
+    draw = environment_attribute(open_environment(environment), "draw")
     if draw is None:
         return picture(lambda axes: draw_trajectory(environment, trajectory, axes))[None]
     shown = _spread(len(trajectory.states), max_frames)
@@ -61,7 +61,7 @@ def film(environment: Any, trajectory: Any, path: str | os.PathLike[str], *, max
     """Write `frames` as an animated GIF, at the speed the dynamics state (`frames_per_second`, 10 by default)."""
     pictures = frames(environment, trajectory, max_frames=max_frames)
     stride = len(trajectory.states) / len(pictures)
-    rate = told(open_environment(environment), "frames_per_second") or 10.0
+    rate = environment_attribute(open_environment(environment), "frames_per_second") or 10.0
     return animation(pictures, path, milliseconds=1000 * stride / rate)
 
 

@@ -12,7 +12,7 @@ from jax import lax
 from threadpoolctl import ThreadpoolController
 from xarray.core import indexing
 
-from bayespbrl.diagnostics.convergence import Convergence, convergence
+from bayespbrl.models.convergence import Convergence, chain_convergence
 from bayespbrl.models.elliptical_slice import EllipticalSlice, EllipticalSliceState
 from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
 from bayespbrl.models.likelihoods import Likelihood, WithTies, log_prob, preference_likelihood, prob, total_log_prob
@@ -133,7 +133,7 @@ def sample_posterior(
         wanted = num_samples
         while True:
             chains = chains.extended(wanted - chains.length)
-            report = convergence(chains.collected("coordinates", wanted) @ fit.factors.loadings.T)
+            report = chain_convergence(chains.collected("coordinates", wanted) @ fit.factors.loadings.T)
             if report.converged() or 2 * wanted > max_samples:
                 break
             wanted *= 2

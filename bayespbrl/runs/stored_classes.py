@@ -15,7 +15,7 @@ import xarray as xr
 
 from bayespbrl.features import JointRadialBasis, OneHot, RadialBasis, StateActionProduct
 from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, TabularPolicy
-from bayespbrl.utility import FitQuality, KnownReward
+from bayespbrl.utility.estimate import FitQuality, KnownReward
 
 # The names by which files know our classes. A name never changes; the class behind it may move.
 STORED: dict[str, type] = {

@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 from gymnasium.spaces import Discrete
 
-from bayespbrl.diagnostics.report_evidence import Evidence
-from bayespbrl.diagnostics.report_findings import ENOUGH_PREDICTIONS, count, figure
+from bayespbrl.diagnostics.report.contents import Evidence
+from bayespbrl.diagnostics.report.summary import ENOUGH_PREDICTIONS, count, figure
 from bayespbrl.preferences import Answer
 
 # Below a tenth of what a uniform choice, or the first policy, has left there is nothing more to explore with; a

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bayespbrl.envs.opening import told
+from bayespbrl.envs.opening import environment_attribute
 
 console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may hold square brackets
 PICTURE = "run.png"
@@ -41,7 +41,7 @@ def show_run(learner: Any) -> None:
 
 def _film(learner: Any, directory: Path) -> str:
     """Film the final policy, and say where or why not: not every environment can be rendered."""
-    from bayespbrl.film import film_policy
+    from bayespbrl.runs.film import film_policy
 
     try:
         film, strip = film_policy(learner, directory)
@@ -118,7 +118,7 @@ def _table(title: str, columns: list[str], rows: list[list[str]]) -> None:
 
 def _print_iterations(learner: Any) -> None:
     """A row for the first iteration, every fifth and the last, narrow enough for eighty columns."""
-    optimum = told(learner.environment, "optimal_return")
+    optimum = environment_attribute(learner.environment, "optimal_return")
     quiet = len({s["answers"] for s in learner.iterations}) < len(learner.iterations)  # answers do not tell them apart
     rows = [
         [
@@ -144,7 +144,7 @@ def print_trials(study: Any) -> None:
     from bayespbrl.rollouts import open_environment
 
     table, quartiles = study.table, study.quartiles()
-    optimum = told(open_environment(table.attrs["env"]), "optimal_return")
+    optimum = environment_attribute(open_environment(table.attrs["env"]), "optimal_return")
     names = ("lower_quartile", "median", "upper_quartile")
     rows = []
     for answers in quartiles["answers"].values:

@@ -40,7 +40,7 @@ class Convergence:
         return self.rhat_max <= rhat_max and self.effective_sample_size_min >= effective_sample_size_min
 
 
-def convergence(draws: np.ndarray) -> Convergence:
+def chain_convergence(draws: np.ndarray) -> Convergence:
     """Diagnose `draws`, shape (chain, draw, ...), at least two chains or four draws.
 
     Raises:

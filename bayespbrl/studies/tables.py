@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import rollouts
-from bayespbrl.cycle import Learner
 from bayespbrl.envs import bicycle
-from bayespbrl.run_directory import read_summary
+from bayespbrl.learner import Learner
+from bayespbrl.runs.directory import read_summary
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value")
 

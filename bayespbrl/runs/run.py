@@ -10,12 +10,12 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import rollouts
-from bayespbrl.cycle import Learner
 from bayespbrl.envs.opening import from_plain, to_plain
+from bayespbrl.improvement.schedules import ConstantBound
+from bayespbrl.learner import Learner
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
-from bayespbrl.run_directory import RunDirectory, fresh_directory
-from bayespbrl.schedules import ConstantBound
+from bayespbrl.runs.directory import RunDirectory, fresh_directory
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
 

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.diagnostics import report_figures as figures
 from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ranks
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.prequential import plot_calibration
-from bayespbrl.diagnostics.report_document import Section, Table, drawn
-from bayespbrl.diagnostics.report_evidence import Evidence
-from bayespbrl.diagnostics.report_findings import cell, figure, iterations_that_asked_nothing, no_posterior
-from bayespbrl.diagnostics.report_tables import progress_table
+from bayespbrl.diagnostics.report import figures
+from bayespbrl.diagnostics.report.contents import Evidence
+from bayespbrl.diagnostics.report.document import Section, Table, drawn
+from bayespbrl.diagnostics.report.summary import cell, figure, iterations_that_asked_nothing, no_posterior
+from bayespbrl.diagnostics.report.tables import progress_table
 from bayespbrl.diagnostics.uncertainty import thinned
 from bayespbrl.settings import WITHOUT_POSTERIOR
 

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.averaging import AveragedUtility
 from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
-from bayespbrl.diagnostics.report_log import AnswerRecord, read_log
+from bayespbrl.diagnostics.report.log import AnswerRecord, read_log
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.features import checked_features
-from bayespbrl.iteration_files import read_parts
 from bayespbrl.models.likelihoods import prob
 from bayespbrl.preferences import Preferences
-from bayespbrl.run_directory import RunDirectory
+from bayespbrl.runs.directory import RunDirectory
+from bayespbrl.runs.iteration_files import read_parts
 from bayespbrl.settings import WITHOUT_POSTERIOR, Settings
 from bayespbrl.trajectories import Trajectory, trajectory_features
+from bayespbrl.utility.averaging import AveragedUtility
 
 
 @dataclass(frozen=True)

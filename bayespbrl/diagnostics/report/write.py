@@ -11,16 +11,9 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from bayespbrl.diagnostics import (
-    report_answers,
-    report_findings,
-    report_sections,
-    report_tables,
-    report_utility,
-    report_warnings,
-)
-from bayespbrl.diagnostics.report_document import Comparison, Picture, Section
-from bayespbrl.diagnostics.report_evidence import Evidence, read_evidence
+from bayespbrl.diagnostics.report import answers, sections, summary, tables, utility, warnings
+from bayespbrl.diagnostics.report.contents import Evidence, read_evidence
+from bayespbrl.diagnostics.report.document import Comparison, Picture, Section
 
 FORMATS = ("html", "md")
 
@@ -44,7 +37,11 @@ def write_report(directory: Path | str, *, format: str = "html", env: Any = None
     if format not in FORMATS:
         raise ValueError(f"format: expected {' or '.join(FORMATS)}, got {format!r}")
     content = assembled(read_evidence(directory, env=env, features=features))
-    template = files("bayespbrl.diagnostics").joinpath(f"report.{format}.jinja").read_text(encoding="utf-8")
+    template = (
+        files("bayespbrl.diagnostics.report")
+        .joinpath("templates", f"report.{format}.jinja")
+        .read_text(encoding="utf-8")
+    )
     # what comes from a run (names, messages) is text and never markup
     engine = Environment(autoescape=format == "html", undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     engine.filters["groupby_adjacent"] = lambda blocks: [
@@ -65,42 +62,40 @@ def write_report(directory: Path | str, *, format: str = "html", env: Any = None
 
 def assembled(evidence: Evidence) -> dict[str, Any]:
     """Everything that the templates name: facts, sentences, warnings and sections."""
-    iterations = report_tables.iterations_table(evidence.iterations)
-    answers = report_tables.answers_table(evidence)
-    scores, ranking = report_tables.prequential_table(evidence), report_tables.ranking_table(evidence)
-    failures: list[report_warnings.Caution] = []
+    iterations = tables.iterations_table(evidence.iterations)
+    answered = tables.answers_table(evidence)
+    scores, ranking = tables.prequential_table(evidence), tables.ranking_table(evidence)
+    failures: list[warnings.Caution] = []
     parts: list[tuple[str, Callable[[], Section]]] = [
-        ("Learning curve", lambda: report_sections.learning(evidence, iterations)),
-        ("Have the fits converged?", lambda: report_sections.fits(evidence, iterations)),
-        ("What it thinks is good", lambda: report_utility.utility(evidence, ranking)),
-        ("The answers", lambda: report_answers.answers(evidence, answers)),
-        ("Are its probabilities right?", lambda: report_sections.calibration(evidence, scores)),
-        ("The policy updates", lambda: report_sections.updates(evidence, iterations)),
-        ("How much leans on σ and m", lambda: report_sections.leaning(evidence)),
-        ("All iterations in figures", lambda: report_sections.numbers(iterations)),
+        ("Learning curve", lambda: sections.learning(evidence, iterations)),
+        ("Have the fits converged?", lambda: sections.fits(evidence, iterations)),
+        ("What it thinks is good", lambda: utility.utility(evidence, ranking)),
+        ("The answers", lambda: answers.answers(evidence, answered)),
+        ("Are its probabilities right?", lambda: sections.calibration(evidence, scores)),
+        ("The policy updates", lambda: sections.updates(evidence, iterations)),
+        ("How much leans on σ and m", lambda: sections.leaning(evidence)),
+        ("All iterations in figures", lambda: sections.numbers(iterations)),
     ]
-    sections = [_built(title, build, failures) for title, build in parts]
+    made = [_built(title, build, failures) for title, build in parts]
     return {
         "title": f"{evidence.settings.env}, {evidence.settings.utility}, seed {evidence.settings.seed}",
         "state": _state(evidence),
         "facts": _facts(evidence),
-        "learnt": report_findings.learnt(evidence, iterations, answers, scores, ranking),
-        "warnings": report_warnings.warnings(evidence, iterations, answers, scores) + failures,
-        "sections": sections,
+        "learnt": summary.learnt(evidence, iterations, answered, scores, ranking),
+        "warnings": warnings.warnings(evidence, iterations, answered, scores) + failures,
+        "sections": made,
         "made": f"Made by bayespbrl {version('bayespbrl')} on {datetime.now():%Y-%m-%d %H:%M} from {evidence.path}.",
     }
 
 
-def _built(title: str, build: Callable[[], Section], failures: list[report_warnings.Caution]) -> Section:
+def _built(title: str, build: Callable[[], Section], failures: list[warnings.Caution]) -> Section:
     """A section, or one that says why it could not be made: whatever an environment or features of the user's raise."""
     try:
         return build()
     except Exception as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         failures.append(
-            report_warnings.Caution(
-                f"The section “{title}” could not be made ({reason}).", "The others are unaffected."
-            )
+            warnings.Caution(f"The section “{title}” could not be made ({reason}).", "The others are unaffected.")
         )
         name = "".join(letter for letter in title.lower() if letter.isalpha())
         return Section(name, title, [f"This section could not be made: {reason}."])

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.diagnostics import report_figures as figures
-from bayespbrl.diagnostics.report_document import Comparison, Picture, Section, Table, drawn, thumbnail
-from bayespbrl.diagnostics.report_evidence import Evidence
-from bayespbrl.diagnostics.report_findings import cell, figure
-from bayespbrl.diagnostics.report_log import AnswerRecord
+from bayespbrl.diagnostics.report import figures
+from bayespbrl.diagnostics.report.contents import Evidence
+from bayespbrl.diagnostics.report.document import Comparison, Picture, Section, Table, drawn, thumbnail
+from bayespbrl.diagnostics.report.log import AnswerRecord
+from bayespbrl.diagnostics.report.summary import cell, figure
 from bayespbrl.envs.pictures import draw_trajectory
 
 # Pictures of the most surprising answers are large, of the others small, and past the cap there are only numbers.

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.averaging import AveragedUtility
-from bayespbrl.diagnostics import report_figures as figures
-from bayespbrl.diagnostics.report_document import Picture, Section, drawn
-from bayespbrl.diagnostics.report_evidence import Evidence
-from bayespbrl.diagnostics.report_findings import no_posterior, percent
-from bayespbrl.diagnostics.report_tables import trajectories_table, utility_table
+from bayespbrl.diagnostics.report import figures
+from bayespbrl.diagnostics.report.contents import Evidence
+from bayespbrl.diagnostics.report.document import Picture, Section, drawn
+from bayespbrl.diagnostics.report.summary import no_posterior, percent
+from bayespbrl.diagnostics.report.tables import trajectories_table, utility_table
 from bayespbrl.diagnostics.uncertainty import plot_ranking
+from bayespbrl.utility.averaging import AveragedUtility
 
 
 def utility(evidence: Evidence, ranking: xr.Dataset) -> Section:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from bayespbrl.events import Entry, LearnerState, surviving
-from bayespbrl.iteration_files import read_iteration, write_iteration
+from bayespbrl.runs.iteration_files import read_iteration, write_iteration
 from bayespbrl.settings import Settings
 
 FORMAT = 2  # 1 named classes by their modules

@@ -8,15 +8,20 @@ import gymnasium
 import jax
 import numpy as np
 
-from bayespbrl import averaging, events, evidence, improvement, queries, rollouts, schedules, utility
-from bayespbrl.envs.opening import as_given, environment_name, given_by_name, told
+from bayespbrl import events, queries, rollouts
+from bayespbrl.envs.opening import as_given, environment_attribute, environment_name, given_by_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import StateActionFeatures, checked_features, draw_state_action_features, draw_state_features
+from bayespbrl.improvement import schedules
+from bayespbrl.improvement import update as improvement
 from bayespbrl.policies.choice import initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
 from bayespbrl.settings import Settings, settings_for
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
+from bayespbrl.utility import averaging
+from bayespbrl.utility import estimate as utility
+from bayespbrl.utility import hyperparameters as evidence
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
 COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED = range(8)
@@ -43,7 +48,7 @@ class Learner:
       env: a short name (`gridworld`, …), a gymnasium id, or an environment.
       features: φ of your own, from observations (N, S) to (N, D); drawn by the settings when None.
       policy: a kind of policy by name, as of `Settings`, or a first policy of your own.
-      schedule: of the KL bound by name, as of `Settings`, or one of your own (`bayespbrl.schedules`).
+      schedule: of the KL bound by name, as of `Settings`, or one of your own (`bayespbrl.improvement.schedules`).
       entries: events of a run to continue.
       kept: the settings of that run, which hold then as they are.
       **settings: options of `Settings`, over the preset of the environment.
@@ -420,7 +425,7 @@ class Learner:
 
     @property
     def _period(self) -> Any:
-        return told(self.environment, "observation_period")
+        return environment_attribute(self.environment, "observation_period")
 
     # Memory and chance.
 

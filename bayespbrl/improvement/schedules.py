@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bayespbrl.improvement import ProposedUpdate
+from bayespbrl.improvement.update import ProposedUpdate
 
 LEAST_BOUND = 0.02  # nats; an update of nothing would leave the draws nothing to disagree about
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl import records
-from bayespbrl.averaging import AveragedUtility
 from bayespbrl.events import Entry
 from bayespbrl.models import restored, stored
+from bayespbrl.runs import stored_classes as records
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility import LinearUtility
+from bayespbrl.utility.averaging import AveragedUtility
+from bayespbrl.utility.estimate import LinearUtility
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Any = "h5netcdf"

@@ -12,7 +12,7 @@ from typing import Any
 from bayespbrl import events
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.preferences import Answer
-from bayespbrl.run_directory import read_summary
+from bayespbrl.runs.directory import read_summary
 from bayespbrl.settings import Settings
 
 

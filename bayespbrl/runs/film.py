@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from bayespbrl import rollouts
-from bayespbrl.cycle import Learner
 from bayespbrl.envs import pictures
-from bayespbrl.envs.opening import environment_name, flattened, made_from, told
+from bayespbrl.envs.opening import environment_attribute, environment_name, flattened, made_from
+from bayespbrl.learner import Learner
 from bayespbrl.policies.actor import Actor
 
 FRAMES = 60  # of the GIF, at most twice as many
@@ -27,7 +27,7 @@ def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tu
     film, strip = directory / f"{name}.gif", directory / f"{name}.png"
     environment, settings = learner.environment, learner.settings
     try:
-        if told(environment, "draw") is not None:
+        if environment_attribute(environment, "draw") is not None:
             shown = rollouts.rollout(
                 environment,
                 learner.policy,

@@ -14,11 +14,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.special import softmax
 
-from bayespbrl.evidence import STEEPNESS_MULTIPLES, number_of_bandwidths, rescaled, rescaled_differences
 from bayespbrl.models.hyperparameters import Candidate, fit_candidate
 from bayespbrl.models.posterior import GaussianFit
 from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility import LinearUtility, StateFeatures, compared, spacing
+from bayespbrl.utility.estimate import LinearUtility, StateFeatures, compared, spacing
+from bayespbrl.utility.hyperparameters import STEEPNESS_MULTIPLES, number_of_bandwidths, rescaled, rescaled_differences
 
 # Of the bandwidths as given, in each state dimension; coarser than those that `evidence.choose_hyperparameters` climbs
 # over, for an average has no need of a maximum.

@@ -14,12 +14,13 @@ from typing import Any
 
 import xarray as xr
 
-from bayespbrl import runs, trial_tables
+from bayespbrl import runs
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.experts import simulated_expert
 from bayespbrl.rollouts import open_environment
-from bayespbrl.run_directory import RunDirectory, read_summary
+from bayespbrl.runs.directory import RunDirectory, read_summary
 from bayespbrl.settings import Settings, settings_for
+from bayespbrl.studies import tables as trial_tables
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 

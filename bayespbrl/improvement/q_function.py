@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from gymnasium import Space
 
-from bayespbrl.lstd import TransitionSums, solve_lstd, transition_sums
+from bayespbrl.improvement.lstd import TransitionSums, solve_lstd, transition_sums
 from bayespbrl.policies import clipped, is_discrete, sample_actions
 from bayespbrl.trajectories import Transitions
 

@@ -10,7 +10,7 @@ from bayespbrl.features import RadialBasis
 from bayespbrl.models import Candidate, search_hyperparameters
 from bayespbrl.preferences import pair_differences
 from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility import StateFeatures, compared, scaled_differences
+from bayespbrl.utility.estimate import StateFeatures, compared, scaled_differences
 
 # What the evidence chooses from: multiples of the bandwidths and of the steepness as given, and lapse rates. Posteriors
 # under σ and m depend on σ·m alone (eq. 8 is a step and a sigmoid of m·t), so σ needs no axis of its own.

@@ -9,9 +9,16 @@ import jax
 import numpy as np
 from gymnasium import Space
 
+from bayespbrl.improvement.q_function import QFunction, estimate_q
+from bayespbrl.improvement.reps import (
+    RepsSolution,
+    WhitenedFeatures,
+    advantages,
+    reps_weights,
+    reps_weights_by_state,
+    whitened,
+)
 from bayespbrl.policies import clipped, entropies, is_discrete, sample_actions
-from bayespbrl.q_function import QFunction, estimate_q
-from bayespbrl.reps import RepsSolution, WhitenedFeatures, advantages, reps_weights, reps_weights_by_state, whitened
 from bayespbrl.trajectories import Transitions
 
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it

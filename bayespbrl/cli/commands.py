@@ -8,7 +8,7 @@ from typing import Annotated, TypedDict, Unpack, get_type_hints
 
 import typer
 
-from bayespbrl.screen import PICTURE, console, draw_trials, print_trials, progress_bar, run_to_the_end, show_run
+from bayespbrl.cli.display import PICTURE, console, draw_trials, print_trials, progress_bar, run_to_the_end, show_run
 
 app = typer.Typer(
     help="Preference-based reinforcement learning: a policy from answers to 'which of these two is better?'.",
@@ -140,7 +140,7 @@ def trials(
     **options: Unpack[RunOptions],
 ) -> None:
     """Run many seeds side by side and print median and quartiles; a second call does only what is missing."""
-    from bayespbrl.trials import run_trials
+    from bayespbrl.studies.trials import run_trials
 
     utility = options.get("utility") or "posterior-mean"
     directory = out or Path("runs") / f"trials-{env.replace('/', '-').lower()}-{utility}"

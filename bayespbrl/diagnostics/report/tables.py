@@ -7,14 +7,14 @@ import numpy as np
 import xarray as xr
 from gymnasium.spaces import Discrete
 
-from bayespbrl.averaging import AveragedUtility
 from bayespbrl.diagnostics.prequential import score_predictions
-from bayespbrl.diagnostics.report_evidence import Evidence
-from bayespbrl.diagnostics.report_log import AnswerRecord
+from bayespbrl.diagnostics.report.contents import Evidence
+from bayespbrl.diagnostics.report.log import AnswerRecord
 from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws
 from bayespbrl.models.likelihoods import prob
 from bayespbrl.preferences import Answer
 from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility.averaging import AveragedUtility
 
 MEASURED = (
     "answers",

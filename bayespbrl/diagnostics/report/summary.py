@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.diagnostics.report_evidence import Evidence
+from bayespbrl.diagnostics.report.contents import Evidence
 from bayespbrl.preferences import Answer
 from bayespbrl.settings import WITHOUT_POSTERIOR
 

@@ -1,0 +1,5 @@
+"""The command line: `bayespbrl run`, `resume`, `report`, `trials`."""
+
+from bayespbrl.cli.commands import main
+
+__all__ = ["main"]

@@ -1,0 +1,1 @@
+"""Step 2: from the utility to a better policy."""
