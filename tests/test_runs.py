@@ -201,8 +201,8 @@ def test_evaluation_is_a_function_of_the_seed(finished):
 
 def test_a_directory_appears_with_its_settings_in_it_or_not_at_all(tmp_path, monkeypatch):
     seen = []
-    write = run_directory._write
-    monkeypatch.setattr(run_directory, "_write", lambda file, text: seen.append(file) or write(file, text))
+    write = run_directory.write_file
+    monkeypatch.setattr(run_directory, "write_file", lambda file, text: seen.append(file) or write(file, text))
     learner = start(tmp_path / "deep" / "run")
     assert seen[0].parent != tmp_path / "deep" / "run"  # written aside
     assert {path.name for path in (tmp_path / "deep").iterdir()} == {"run"}
@@ -212,7 +212,7 @@ def test_a_directory_appears_with_its_settings_in_it_or_not_at_all(tmp_path, mon
     def full(file, text):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(run_directory, "_write", full)
+    monkeypatch.setattr(run_directory, "write_file", full)
     with pytest.raises(ValueError, match=r"other: cannot make a run directory there \(no space left"):
         start(tmp_path / "other")
     assert {path.name for path in tmp_path.iterdir()} == {"deep"}
@@ -462,7 +462,7 @@ def test_an_event_that_could_not_be_kept_is_taken_back_and_can_be_tried_again(tm
         raise error("stopped")
 
     if fails == "summary":
-        monkeypatch.setattr(run_directory, "_write", fail)
+        monkeypatch.setattr(run_directory, "write_file", fail)
     else:
         monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(error, match="stopped"):

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from bayespbrl.events import Entry, LearnerState, surviving
+from bayespbrl.runs.files import write_file
 from bayespbrl.runs.iteration_files import read_iteration, write_iteration
 from bayespbrl.settings import Settings
 
@@ -48,7 +49,7 @@ class RunDirectory:
             building = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
             try:
                 building.chmod(0o755)
-                _write(building / "settings.json", json.dumps(content, indent=2) + "\n")
+                write_file(building / "settings.json", json.dumps(content, indent=2) + "\n")
                 (building / "iterations").mkdir()
                 building.rename(path)
             except OSError:
@@ -204,7 +205,7 @@ class RunDirectory:
             "answers": state.preferences.answers,
             "iterations": list(state.summaries),
         }
-        _write(self.path / "summary.json", json.dumps(summary, indent=1) + "\n")
+        write_file(self.path / "summary.json", json.dumps(summary, indent=1) + "\n")
 
 
 def read_summary(directory: Path | str) -> dict[str, Any]:
@@ -227,13 +228,3 @@ def fresh_directory(env: str) -> Path:
         count += 1
         path = Path("runs") / f"{stem}-{count}"
     return path
-
-
-def _write(file: Path, text: str) -> None:
-    """Write aside, flush to the disk, rename into place."""
-    aside = file.with_name(file.name + ".part")
-    with aside.open("w", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    aside.replace(file)

@@ -1,6 +1,5 @@
 """The heavy parts of one iteration as one netCDF file: trajectories, policy, utility estimate and its posterior."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import xarray as xr
 from bayespbrl.events import Entry
 from bayespbrl.models import restored, stored
 from bayespbrl.runs import stored_classes as records
+from bayespbrl.runs.files import written_aside
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.averaging import AveragedUtility
 from bayespbrl.utility.estimate import LinearUtility
@@ -21,18 +21,14 @@ PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "policy", 
 
 
 def write_iteration(file: Path, entry: Entry) -> None:
-    """The heavy parts of one iteration as one netCDF file, written aside and renamed into place."""
+    """The heavy parts of one iteration as one netCDF file, whole or not at all."""
     parts = entry.parts
     groups = {"trajectories": xr.DataTree(_trajectories_dataset(parts["trajectories"]))}
     if "policy" in parts:
         groups["policy"] = records.to_tree(parts["policy"])
         groups |= _estimate_groups(parts["estimate"])
-    aside = file.with_suffix(".nc.part")
-    aside.unlink(missing_ok=True)  # HDF5 refuses a file that an interrupted write left open
-    xr.DataTree.from_dict(groups).to_netcdf(aside, engine=ENGINE)
-    with aside.open("rb") as written:
-        os.fsync(written.fileno())
-    aside.replace(file)
+    with written_aside(file) as aside:
+        xr.DataTree.from_dict(groups).to_netcdf(aside, engine=ENGINE)
 
 
 def read_iteration(file: Path, event: str, *, features: Any = None, known: Sequence[type] = ()) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from bayespbrl import rollouts
 from bayespbrl.envs import bicycle
 from bayespbrl.learner import Learner
 from bayespbrl.runs.directory import read_summary
+from bayespbrl.runs.files import write_file, written_aside
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value")
 
@@ -104,21 +105,21 @@ def measure_balancing(learner: Learner, directory: Path, *, max_steps: int, epis
         "mean_steps": float(lasted.steps.mean()),
         "terminated": float(lasted.terminated.mean()),
     }
-    aside = directory / f"{BALANCING_FILE}.part"
-    aside.write_text(json.dumps(content, indent=1) + "\n")
-    aside.replace(directory / BALANCING_FILE)
+    write_file(directory / BALANCING_FILE, json.dumps(content, indent=1) + "\n")
 
 
 def write_tables(table: xr.Dataset, directory: Path) -> None:
-    """`trials.csv`, one row a trial and iteration, and `trials.nc`, both renamed into place.
+    """`trials.csv`, one row a trial and iteration, and `trials.nc`, each whole or not at all.
 
     Where lasting is the task, the share of evaluation episodes that survive is a column more, and the balancing time
     of the final policy two more, filled in the row of the last iteration.
     """
-    aside = directory / "trials.csv.part"
     balancing = "balancing_steps" in table
     last = table["iteration"].values[-1]
-    with aside.open("w", newline="", encoding="utf-8") as file:
+    with (
+        written_aside(directory / "trials.csv") as aside,
+        aside.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(COLUMNS + (BALANCING_COLUMNS if balancing else ()))
         for number in table["seed"].values:
@@ -132,10 +133,8 @@ def write_tables(table: xr.Dataset, directory: Path) -> None:
                         *(_balancing(cell) if iteration == last else ("", "")),
                     ]
                 writer.writerow(row)
-    aside.replace(directory / "trials.csv")
-    aside = directory / "trials.nc.part"
-    table.to_netcdf(aside, engine="h5netcdf")
-    aside.replace(directory / "trials.nc")
+    with written_aside(directory / "trials.nc") as aside:
+        table.to_netcdf(aside, engine="h5netcdf")
 
 
 def _balancing(cell: xr.Dataset) -> tuple[float, float]:
