@@ -8,11 +8,12 @@ from scipy.special import logsumexp
 
 from bayespbrl.models import (
     Candidate,
+    HyperparameterSearch,
+    PreferenceModel,
     posterior,
     restored,
     sample_posterior,
     search_hyperparameters,
-    select_hyperparameters,
     stored,
 )
 from bayespbrl.models.convergence import chain_convergence
@@ -195,7 +196,7 @@ def test_results_are_float64_and_the_global_flag_is_left_alone(tree):
 
 def test_ellipses_of_the_low_rank_problem_have_the_models_density():
     differences = consistent(6, 9)
-    fit = fit_gaussian(differences, prior_scale=1.7, likelihood=Mixed(5.0, 6.0))
+    fit = fit_gaussian(differences, PreferenceModel(prior_scale=1.7))
     with jax.enable_x64(True):
         problem = padded_problem(
             fit.factors.loadings,
@@ -219,7 +220,7 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
 
 
 def test_numpyros_mcmc_gives_the_same_draws_as_the_compiled_loop():
-    fit = fit_gaussian(consistent(6, 9), prior_scale=1.0, likelihood=Mixed(5.0, 6.0))
+    fit = fit_gaussian(consistent(6, 9), PreferenceModel())
     with jax.enable_x64(True):
         chains = posterior._Chains.start(fit, num_chains=2, chunk=5, seed=0)
         mcmc = MCMC(
@@ -239,7 +240,7 @@ def test_numpyros_mcmc_gives_the_same_draws_as_the_compiled_loop():
 
 def test_chains_started_in_the_far_tail_forget_it():
     differences = consistent(20, 40)
-    fit = fit_gaussian(differences, prior_scale=1.0, likelihood=Mixed(5.0, 20.0))
+    fit = fit_gaussian(differences, PreferenceModel())
     with jax.enable_x64(True):
         chains = posterior._Chains.start(fit, num_chains=4, chunk=100, seed=0)
         far = {
@@ -308,11 +309,10 @@ def test_evidence_finds_the_length_scale_that_ordered_the_pairs():
     for length_scale in features:
         difference = features[length_scale][:60] - features[length_scale][60:]
         difference *= np.sign(utility[:60] - utility[60:])[:, None]
-        candidates.append(Candidate(difference / np.abs(difference).max()))
-    result = select_hyperparameters(candidates)
-    assert result.best == 1
-    assert result.weights[1] > 0.9
-    np.testing.assert_allclose(result.weights.sum(), 1)
+        candidates.append(Candidate(difference / np.abs(difference).max(), PreferenceModel()))
+    log_evidence = np.array([candidate.fit().log_evidence for candidate in candidates])
+    assert np.argmax(log_evidence) == 1
+    assert HyperparameterSearch(np.array([list(features)]).T, log_evidence, reached=1).weights[1] > 0.9
 
 
 def test_the_climb_ends_where_no_neighbour_on_the_grid_is_more_likely_and_finds_a_length_scale_for_each_dimension():
@@ -328,28 +328,29 @@ def test_the_climb_ends_where_no_neighbour_on_the_grid_is_more_likely_and_finds_
     def candidate(point):
         rows = features(np.array(point[:2]))
         difference = (rows[:80] - rows[80:]) * np.sign(utility[:80] - utility[80:])[:, None]
-        return Candidate(difference / np.abs(difference).max(), steepness=point[2])
+        return Candidate(difference / np.abs(difference).max(), PreferenceModel(steepness=point[2]))
 
     axes = [(0.05, 0.7, 5.0, 20.0), (0.05, 0.7, 5.0, 20.0), (1.0, 5.0)]
     search = search_hyperparameters(candidate, axes, start=(0.05, 0.05, 5.0), together=2)
     assert search.best[0] == 0.7
     assert search.best[1] >= 5.0
-    found = dict(zip(map(tuple, search.points.tolist()), search.weighed.log_evidence, strict=True))
+    found = dict(zip(map(tuple, search.points.tolist()), search.log_evidence, strict=True))
     assert tuple(search.points[0]) == (0.05, 0.05, 5.0)
     assert found[search.best] == max(found.values())
     for axis, values in enumerate(axes):
         for value in values:
             neighbour = (*search.best[:axis], value, *search.best[axis + 1 :])
             if abs(values.index(value) - values.index(search.best[axis])) == 1:
-                assert select_hyperparameters([candidate(neighbour)]).log_evidence[0] <= found[search.best] + 1e-6
-    np.testing.assert_allclose(search.weighed.weights.sum(), 1)
+                assert candidate(neighbour).fit().log_evidence <= found[search.best] + 1e-6
+    np.testing.assert_allclose(search.weights.sum(), 1)
 
 
 def test_the_climb_stays_where_the_answers_say_nothing():
-    search = search_hyperparameters(lambda _: Candidate(np.zeros((3, 2))), [(1.0, 2.0)], start=(2.0,))
+    nothing = Candidate(np.zeros((3, 2)), PreferenceModel())
+    search = search_hyperparameters(lambda _: nothing, [(1.0, 2.0)], start=(2.0,))
     assert search.best == (2.0,)
     with pytest.raises(ValueError, match=r"start: expected a value of each of 1 axes, got \(3.0,\)"):
-        search_hyperparameters(lambda _: Candidate(np.zeros((3, 2))), [(1.0, 2.0)], start=(3.0,))
+        search_hyperparameters(lambda _: nothing, [(1.0, 2.0)], start=(3.0,))
 
 
 @pytest.mark.parametrize(
@@ -374,10 +375,3 @@ def test_the_climb_stays_where_the_answers_say_nothing():
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         sample_posterior(**{"differences": np.ones((2, 3)), **arguments})
-
-
-def test_candidates_about_different_answers_are_refused():
-    with pytest.raises(ValueError, match="candidates: expected the same number"):
-        select_hyperparameters([Candidate(np.ones((2, 3))), Candidate(np.ones((3, 3)))])
-    with pytest.raises(ValueError, match="candidates: expected at least one"):
-        select_hyperparameters([])

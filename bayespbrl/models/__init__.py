@@ -11,28 +11,22 @@ linear_program           eq. 10, the alternative to the posterior
 """
 
 from bayespbrl.models.elliptical_slice import EllipticalSlice
-from bayespbrl.models.hyperparameters import (
-    Candidate,
-    HyperparameterSearch,
-    HyperparameterWeights,
-    search_hyperparameters,
-    select_hyperparameters,
-)
+from bayespbrl.models.hyperparameters import Candidate, HyperparameterSearch, search_hyperparameters
 from bayespbrl.models.linear_program import LinearProgramResult, linear_program
-from bayespbrl.models.posterior import restored, sample_posterior, stored
-from bayespbrl.models.preference_model import preference_model
+from bayespbrl.models.posterior import posterior_draws, restored, sample_posterior, stored
+from bayespbrl.models.preference_model import PreferenceModel, preference_model
 
 __all__ = [
     "Candidate",
     "EllipticalSlice",
     "HyperparameterSearch",
-    "HyperparameterWeights",
     "LinearProgramResult",
+    "PreferenceModel",
     "linear_program",
+    "posterior_draws",
     "preference_model",
     "restored",
     "sample_posterior",
     "search_hyperparameters",
-    "select_hyperparameters",
     "stored",
 ]

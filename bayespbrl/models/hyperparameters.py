@@ -9,100 +9,53 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from bayespbrl.models.likelihoods import preference_likelihood
 from bayespbrl.models.posterior import GaussianFit, fit_gaussian
+from bayespbrl.models.preference_model import PreferenceModel
 
 LEAST_GAIN = 1e-6  # nats; evidence that differs by rounding only says nothing
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One setting to be weighed; `differences` carries its features, and so its length scale.
+    """One setting to be weighed.
 
     Attributes:
-      differences: ψ(preferred) − ψ(dominated), shape (K, D), D as this candidate's features have it.
-      prior_scale, steepness, lapse_rate, likelihood: as in `sample_posterior`.
-      log_prior: log of the weight that the candidate had before the answers, up to a constant.
+      differences: ψ(preferred) − ψ(dominated), shape (K, D), D as this candidate's features have it; they carry its
+        length scales.
+      model: prior and likelihood.
     """
 
     differences: np.ndarray
-    prior_scale: float = 1.0
-    steepness: float = 5.0
-    lapse_rate: float = 0.0
-    likelihood: str = "mixed"
-    log_prior: float = 0.0
+    model: PreferenceModel
 
-
-@dataclass(frozen=True)
-class HyperparameterWeights:
-    """What the answers say about the candidates, in their order.
-
-    Attributes:
-      weights: posterior probability of each, shape (C,), summing to 1.
-      log_evidence: log p(answers | candidate) by expectation propagation, shape (C,).
-      converged: whether each fit did, shape (C,) bool.
-    """
-
-    weights: np.ndarray
-    log_evidence: np.ndarray
-    converged: np.ndarray
-
-    @property
-    def best(self) -> int:
-        """Index of the candidate of highest weight."""
-        return int(np.argmax(self.weights))
-
-
-def fit_candidate(candidate: Candidate) -> GaussianFit:
-    """Expectation propagation's Gaussian under this setting, with its log evidence; errors as of `fit_gaussian`."""
-    c = candidate
-    likelihood = preference_likelihood(
-        c.likelihood, steepness=c.steepness, number_of_preferences=len(c.differences), lapse_rate=c.lapse_rate
-    )
-    return fit_gaussian(c.differences, prior_scale=c.prior_scale, likelihood=likelihood)
-
-
-def select_hyperparameters(candidates: Sequence[Candidate]) -> HyperparameterWeights:
-    """Weigh candidates by p(candidate | answers) ∝ p(answers | candidate) p(candidate).
-
-    All candidates must be about the same answers: the same K.
-
-    Raises:
-      ValueError: no candidates, candidates of different K, or an argument out of its range.
-    """
-    if not candidates:
-        raise ValueError("candidates: expected at least one, got none")
-    numbers = sorted({len(candidate.differences) for candidate in candidates})
-    if len(numbers) > 1:
-        raise ValueError(f"candidates: expected the same number of answers K in each, got {numbers}")
-    fits = [fit_candidate(candidate) for candidate in candidates]
-    log_evidence = np.array([fit.log_evidence for fit in fits])
-    log_weights = log_evidence + np.array([candidate.log_prior for candidate in candidates])
-    return HyperparameterWeights(
-        np.exp(log_weights - logsumexp(log_weights)),
-        log_evidence,
-        np.array([fit.approximation.converged for fit in fits]),
-    )
+    def fit(self) -> GaussianFit:
+        """Expectation propagation's Gaussian under this setting, with its log evidence; errors as of `fit_gaussian`."""
+        return fit_gaussian(self.differences, self.model)
 
 
 @dataclass(frozen=True)
 class HyperparameterSearch:
-    """A climb over a grid by the evidence.
+    """A climb over a grid by the marginal likelihood.
 
     Attributes:
       points: the settings that were examined, in their order, shape (C, axes).
-      weighed: what the answers say about them.
+      log_evidence: log p(answers | setting) of each by expectation propagation, shape (C,).
       reached: index of the point where the climb ended.
     """
 
     points: np.ndarray
-    weighed: HyperparameterWeights
+    log_evidence: np.ndarray
     reached: int
 
     @property
     def best(self) -> tuple[float, ...]:
         """The setting where the climb ended."""
         return tuple(self.points[self.reached].tolist())
+
+    @property
+    def weights(self) -> np.ndarray:
+        """p(setting | answers) of each, all being as likely beforehand, shape (C,), summing to 1."""
+        return np.exp(self.log_evidence - logsumexp(self.log_evidence))
 
 
 def search_hyperparameters(
@@ -128,16 +81,16 @@ def search_hyperparameters(
       the points examined and where it ended: at the start, where the answers speak for nothing else.
 
     Raises:
-      ValueError: a start that is not on the grid; else as `select_hyperparameters`.
+      ValueError: a start that is not on the grid; else as `fit_gaussian`.
     """
     if len(start) != len(axes) or any(value not in axis for value, axis in zip(start, axes, strict=True)):
         raise ValueError(f"start: expected a value of each of {len(axes)} axes, got {tuple(start)}")
-    found: dict[tuple[float, ...], HyperparameterWeights] = {}
+    found: dict[tuple[float, ...], float] = {}
 
     def weigh(point: tuple[float, ...]) -> float:
         if point not in found:
-            found[point] = select_hyperparameters([candidate(point)])
-        return float(found[point].log_evidence[0])
+            found[point] = float(candidate(point).fit().log_evidence)
+        return found[point]
 
     def better(point: tuple[float, ...], best: tuple[float, ...]) -> bool:
         return weigh(point) > weigh(best) + LEAST_GAIN
@@ -159,13 +112,8 @@ def search_hyperparameters(
                     best, position = point, position + direction
         if best == before:
             break
-    log_evidence = np.concatenate([weighed.log_evidence for weighed in found.values()])
     return HyperparameterSearch(
         points=np.array(list(found)).reshape(len(found), -1),
-        weighed=HyperparameterWeights(
-            np.exp(log_evidence - logsumexp(log_evidence)),
-            log_evidence,
-            np.concatenate([weighed.converged for weighed in found.values()]),
-        ),
+        log_evidence=np.array(list(found.values())),
         reached=list(found).index(best),
     )

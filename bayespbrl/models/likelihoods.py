@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+LIKELIHOODS = ("mixed", "logistic", "probit")  # names of those that have neither lapses nor ties
+
 
 class ProbitMixture(NamedTuple):
     """p(t) = constant + Σⱼ weights[j] Φ((t − offsets[j]) / scales[j]); a scale of 0 is a step with ½ at its offset.

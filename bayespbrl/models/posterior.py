@@ -12,12 +12,14 @@ from jax import lax
 from threadpoolctl import ThreadpoolController
 from xarray.core import indexing
 
+from bayespbrl import checks
 from bayespbrl.models.convergence import Convergence, chain_convergence
 from bayespbrl.models.elliptical_slice import EllipticalSlice, EllipticalSliceState
 from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
-from bayespbrl.models.likelihoods import Likelihood, WithTies, log_prob, preference_likelihood, prob, total_log_prob
+from bayespbrl.models.likelihoods import Likelihood, log_prob, prob, total_log_prob
 from bayespbrl.models.low_rank import LowRank, UtilityWeights, low_rank, used_rows
 from bayespbrl.models.preference_model import (
+    PreferenceModel,
     PreferenceProblem,
     low_rank_model,
     padded_problem,
@@ -37,20 +39,36 @@ REFERENCE_MOVES, PRIOR_MOVES = 26, 6
 CHUNK = 25
 
 
+@dataclass(frozen=True)
+class SamplerOptions:
+    """How long the chains are; attributes as the keywords of `sample_posterior`."""
+
+    num_warmup: int = 25
+    num_samples: int = 250
+    max_samples: int = 8_000
+    num_chains: int = 4
+
+    def __post_init__(self) -> None:
+        checks.whole("num_warmup", self.num_warmup, 0)
+        checks.whole("num_samples", self.num_samples, 4)
+        checks.whole("max_samples", self.max_samples, self.num_samples)
+        checks.whole("num_chains", self.num_chains, 2)
+
+
 def sample_posterior(
     differences: np.ndarray,
     *,
-    prior_scale: float = 1.0,
-    steepness: float = 5.0,
-    lapse_rate: float = 0.0,
-    likelihood: str = "mixed",
+    prior_scale: float = PreferenceModel.prior_scale,
+    steepness: float = PreferenceModel.steepness,
+    lapse_rate: float = PreferenceModel.lapse_rate,
+    likelihood: str = PreferenceModel.likelihood,
     indifferent: np.ndarray | None = None,
-    tie_threshold: float | None = None,
+    tie_threshold: float | None = PreferenceModel.tie_threshold,
     number_of_preferences: int | None = None,
-    num_warmup: int = 25,
-    num_samples: int = 250,
-    max_samples: int = 8_000,
-    num_chains: int = 4,
+    num_warmup: int = SamplerOptions.num_warmup,
+    num_samples: int = SamplerOptions.num_samples,
+    max_samples: int = SamplerOptions.max_samples,
+    num_chains: int = SamplerOptions.num_chains,
     seed: int = 0,
 ) -> xr.DataTree:
     """Draw from the posterior of the utility weights w ~ N(0, σ²I) given preferences (eqs. 7-8), until it converges.
@@ -92,49 +110,49 @@ def sample_posterior(
     Raises:
       ValueError: an argument out of its range, named with what came.
     """
-    differences = _checked(differences, prior_scale=prior_scale)
-    for name, value, least in (
-        ("num_warmup", num_warmup, 0),
-        ("num_samples", num_samples, 4),
-        ("max_samples", max_samples, num_samples),
-        ("num_chains", num_chains, 2),
-        ("seed", seed, 0),
-    ):
-        if not isinstance(value, int | np.integer) or value < least:
-            raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")
-    number_of_preferences = len(differences) if number_of_preferences is None else number_of_preferences
-    fit = fit_gaussian(
+    return posterior_draws(
         differences,
-        prior_scale=prior_scale,
-        likelihood=_with_ties(
-            preference_likelihood(
-                likelihood,
-                steepness=steepness,
-                number_of_preferences=number_of_preferences,
-                lapse_rate=lapse_rate,
-            ),
-            len(differences),
-            indifferent,
-            tie_threshold,
-        ),
+        PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold),
+        seed=seed,
+        indifferent=indifferent,
+        number_of_preferences=number_of_preferences,
+        sampler=SamplerOptions(num_warmup, num_samples, max_samples, num_chains),
     )
+
+
+def posterior_draws(
+    differences: np.ndarray,
+    model: PreferenceModel,
+    *,
+    seed: int,
+    indifferent: np.ndarray | None = None,
+    number_of_preferences: int | None = None,
+    sampler: SamplerOptions | None = None,
+) -> xr.DataTree:
+    """`sample_posterior` for a model that is at hand; `sampler` None takes the default `SamplerOptions`."""
+    differences = _checked(differences)
+    seed = checks.whole("seed", seed, 0)
+    sampler = SamplerOptions() if sampler is None else sampler
+    number_of_preferences = len(differences) if number_of_preferences is None else number_of_preferences
+    fit = fit_gaussian(differences, model, indifferent=indifferent, number_of_preferences=number_of_preferences)
     settings = {
-        "prior_scale": float(prior_scale),
-        "steepness": float(steepness),
-        "lapse_rate": float(lapse_rate),
-        "likelihood": likelihood,
+        "prior_scale": float(model.prior_scale),
+        "steepness": float(model.steepness),
+        "lapse_rate": float(model.lapse_rate),
+        "likelihood": model.likelihood,
         "number_of_preferences": int(number_of_preferences),
-        "tie_threshold": float("nan") if tie_threshold is None else float(tie_threshold),
-        "seed": int(seed),
+        "tie_threshold": float("nan") if model.tie_threshold is None else float(model.tie_threshold),
+        "seed": seed,
     }
     with jax.enable_x64(True), _one_blas_thread():
-        chains = _Chains.start(fit, num_chains=num_chains, chunk=min(num_samples, CHUNK), seed=seed)
-        chains = replace(chains.extended(num_warmup), draws=())
-        wanted = num_samples
+        chunk = min(sampler.num_samples, CHUNK)
+        chains = _Chains.start(fit, num_chains=sampler.num_chains, chunk=chunk, seed=seed)
+        chains = replace(chains.extended(sampler.num_warmup), draws=())
+        wanted = sampler.num_samples
         while True:
             chains = chains.extended(wanted - chains.length)
             report = chain_convergence(chains.collected("coordinates", wanted) @ fit.factors.loadings.T)
-            if report.converged() or 2 * wanted > max_samples:
+            if report.converged() or 2 * wanted > sampler.max_samples:
                 break
             wanted *= 2
     return _tree(differences, fit, chains, wanted, report, settings)
@@ -159,11 +177,27 @@ class GaussianFit:
     log_evidence: float
 
 
-def fit_gaussian(differences: np.ndarray, *, prior_scale: float, likelihood: Likelihood) -> GaussianFit:
-    """Factorise the differences (K, D) and fit a Gaussian by expectation propagation: how `sample_posterior` begins."""
-    differences = _checked(differences, prior_scale=prior_scale)
+def fit_gaussian(
+    differences: np.ndarray,
+    model: PreferenceModel,
+    *,
+    indifferent: np.ndarray | None = None,
+    number_of_preferences: int | None = None,
+) -> GaussianFit:
+    """Factorise the differences (K, D) and fit a Gaussian by expectation propagation: how `sample_posterior` begins.
+
+    Args:
+      differences, indifferent, number_of_preferences: as of `sample_posterior`.
+      model: prior and likelihood.
+    """
+    differences = _checked(differences)
+    number = len(differences)
+    tied = np.zeros(number, dtype=bool) if indifferent is None else np.asarray(indifferent)
+    if tied.shape != (number,) or tied.dtype != bool:
+        raise ValueError(f"indifferent: expected bool of shape ({number},), got {tied.dtype} of shape {tied.shape}")
+    likelihood = model.answer_likelihood(number if number_of_preferences is None else number_of_preferences, tied)
     with _one_blas_thread():
-        return _fit_gaussian(differences, prior_scale, likelihood)
+        return _fit_gaussian(differences, model.prior_scale, likelihood)
 
 
 def _fit_gaussian(differences: np.ndarray, prior_scale: float, likelihood: Likelihood) -> GaussianFit:
@@ -274,28 +308,11 @@ def _run(
     return last, states, answers
 
 
-def _checked(differences: np.ndarray, *, prior_scale: float) -> np.ndarray:
-    differences = np.asarray(differences, dtype=np.float64)
-    if differences.ndim != 2 or differences.shape[1] == 0:
+def _checked(differences: np.ndarray) -> np.ndarray:
+    differences = checks.matrix("differences", differences)
+    if differences.shape[1] == 0:
         raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
-    if not np.all(np.isfinite(differences)):
-        raise ValueError(f"differences: expected finite entries, got {np.sum(~np.isfinite(differences))} that are not")
-    if not (np.isfinite(prior_scale) and prior_scale > 0):
-        raise ValueError(f"prior_scale: expected a finite number > 0, got {prior_scale}")
     return differences
-
-
-def _with_ties(likelihood: Any, number: int, indifferent: np.ndarray | None, threshold: float | None) -> Likelihood:
-    if threshold is None:
-        if indifferent is not None and np.any(indifferent):
-            raise ValueError("tie_threshold: expected a number > 0 because some answers are indifferent, got None")
-        return likelihood
-    if not (np.isfinite(threshold) and threshold > 0):
-        raise ValueError(f"tie_threshold: expected a finite number > 0, got {threshold}")
-    tied = np.zeros(number, dtype=bool) if indifferent is None else np.asarray(indifferent)
-    if tied.shape != (number,) or tied.dtype != bool:
-        raise ValueError(f"indifferent: expected bool of shape ({number},), got {tied.dtype} of shape {tied.shape}")
-    return WithTies(likelihood, float(threshold), tied)
 
 
 def _tree(

@@ -1,4 +1,4 @@
-"""The model of Bayesian PBIRL in NumPyro (eqs. 7-8), and the ellipses that make it fast to sample.
+"""The model of Bayesian PBIRL (eqs. 7-8): its options, its form in NumPyro, and the ellipses that sample it fast.
 
 `preference_model` is for any matrix of differences and any NumPyro algorithm. `PreferenceProblem` is the same model
 after the thin factorisation, with a Gaussian reference, padded so that problems of different size share a compilation.
@@ -13,9 +13,80 @@ import numpyro
 import numpyro.distributions as dist
 from jax import random
 
+from bayespbrl import checks
 from bayespbrl.models.elliptical_slice import Ellipse
-from bayespbrl.models.likelihoods import Likelihood, WithTies, log_prob, total_log_prob
+from bayespbrl.models.likelihoods import (
+    LIKELIHOODS,
+    Likelihood,
+    Logistic,
+    Mixed,
+    Probit,
+    WithLapses,
+    WithTies,
+    log_prob,
+    total_log_prob,
+)
 from bayespbrl.models.low_rank import used_rows
+
+
+@dataclass(frozen=True)
+class PreferenceModel:
+    """Prior and likelihood of the posterior (eqs. 7-8): w ~ N(0, σ²I), and p(answer | margin t = wᵀ difference).
+
+    σ and m have units: those of the differences that the model is used with. Only σ·m matters for the probabilities.
+
+    Attributes:
+      prior_scale: σ > 0, the standard deviation of each weight.
+      steepness: m > 0, the slope of the sigmoid in the margin.
+      lapse_rate: λ in [0, 1), the probability that an answer is a coin toss.
+      likelihood: "mixed" (eq. 8), "logistic" (Bradley-Terry) or "probit" (Thurstone).
+      tie_threshold: δ > 0: margins within it are often answered with "no difference". None: such answers never occur.
+    """
+
+    prior_scale: float = 1.0
+    steepness: float = 5.0
+    lapse_rate: float = 0.0
+    likelihood: str = "mixed"
+    tie_threshold: float | None = None
+
+    def __post_init__(self) -> None:
+        checks.positive("prior_scale", self.prior_scale)
+        checks.positive("steepness", self.steepness)
+        checks.share("lapse_rate", self.lapse_rate, below_one=True)
+        checks.one_of("likelihood", self.likelihood, LIKELIHOODS)
+        if self.tie_threshold is not None:
+            checks.positive("tie_threshold", self.tie_threshold)
+
+    def answer_likelihood(self, number_of_preferences: int, indifferent: np.ndarray | None = None) -> Likelihood:
+        """The probability of each answer as a function of its margin.
+
+        Args:
+          number_of_preferences: K of eq. 8.
+          indifferent: which answers were "no difference", bool, one entry for each margin; needs `tie_threshold`. None:
+            one for each of the K preferences, all False.
+
+        Raises:
+          ValueError: indifferent answers without a tie threshold, or `indifferent` that is no vector of bool.
+        """
+        steepness = float(self.steepness)
+        likelihood: Mixed | Logistic | Probit | WithLapses
+        match self.likelihood:
+            case "mixed":
+                likelihood = Mixed(steepness, float(max(number_of_preferences, 1)))
+            case "logistic":
+                likelihood = Logistic(steepness)
+            case _:
+                likelihood = Probit(steepness)
+        if self.lapse_rate > 0:
+            likelihood = WithLapses(likelihood, float(self.lapse_rate))
+        tied = np.zeros(number_of_preferences, dtype=bool) if indifferent is None else np.asarray(indifferent)
+        if self.tie_threshold is None:
+            if np.any(tied):
+                raise ValueError("tie_threshold: expected a number > 0 because some answers are indifferent, got None")
+            return likelihood
+        if tied.ndim != 1 or tied.dtype != bool:
+            raise ValueError(f"indifferent: expected a vector of bool, got {tied.dtype} of shape {tied.shape}")
+        return WithTies(likelihood, float(self.tie_threshold), tied)
 
 
 def preference_model(differences, likelihood: Likelihood, *, prior_scale=1.0, used=True) -> None:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.special import softmax
 
-from bayespbrl.models.hyperparameters import Candidate, fit_candidate
-from bayespbrl.models.posterior import GaussianFit
+from bayespbrl.models import PreferenceModel
+from bayespbrl.models.posterior import GaussianFit, fit_gaussian
 from bayespbrl.trajectories import Trajectory, trajectory_features
 from bayespbrl.utility.estimate import LinearUtility, StateFeatures, compared, spacing
 from bayespbrl.utility.hyperparameters import STEEPNESS_MULTIPLES, number_of_bandwidths, rescaled, rescaled_differences
@@ -103,10 +103,10 @@ def average_utility(
     features: StateFeatures,
     *,
     discount: float,
-    prior_scale: float = 1.0,
-    steepness: float = 5.0,
-    lapse_rate: float = 0.0,
-    likelihood: str = "mixed",
+    prior_scale: float = PreferenceModel.prior_scale,
+    steepness: float = PreferenceModel.steepness,
+    lapse_rate: float = PreferenceModel.lapse_rate,
+    likelihood: str = PreferenceModel.likelihood,
     seed: int = 0,
 ) -> AveragedUtility:
     """The mixture over all settings round `chosen`.
@@ -126,14 +126,8 @@ def average_utility(
         scales.append(scale)
         fits.append([])
         for relative in STEEPNESS_MULTIPLES:
-            candidate = Candidate(
-                differences,
-                prior_scale=prior_scale,
-                steepness=steepness * relative,
-                lapse_rate=lapse_rate,
-                likelihood=likelihood,
-            )
-            fits[-1].append(fit_candidate(candidate))
+            model = PreferenceModel(prior_scale, steepness * relative, lapse_rate, likelihood)
+            fits[-1].append(fit_gaussian(differences, model))
     weights = softmax([[fit.log_evidence for fit in row] for row in fits])
     counts = np.flatnonzero(weights.sum(axis=1) >= LEAST_PROBABILITY)
     weights = weights[counts] / weights[counts].sum()
