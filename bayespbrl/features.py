@@ -7,27 +7,31 @@ observations; `checked_features` calls it.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete
+from jaxtyping import Float, Int, Shaped
 from numpy.typing import ArrayLike
 
+from bayespbrl.checks import matrix, positive, whole
 from bayespbrl.kernels import as_periods, median_bandwidths, radial_basis
 
-StateFeatures = Callable[[np.ndarray], np.ndarray]
-StateActionFeatures = Callable[[np.ndarray, np.ndarray], np.ndarray]
+StateFeatures = Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
+StateActionFeatures = Callable[[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
+
+ACTION_BANDWIDTH = 0.5  # of the action kernel, as a fraction of the action's range
 
 
 @dataclass(frozen=True, eq=False)
 class OneHot:
-    """φ(s) = e_s for discrete states: with it a linear function of the features is exact, not an approximation."""
+    """φ(s) = e_s for discrete states, which makes linear functions of the features exact."""
 
     number_of_states: int
 
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Features of integer observations of shape (N,); shape (N, number_of_states)."""
+    def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n {self.number_of_states}"]:
+        """Features of N integer observations."""
         observations = np.asarray(observations)
         if observations.ndim != 1 or not np.issubdtype(observations.dtype, np.integer):
             raise ValueError(
@@ -48,21 +52,20 @@ class RadialBasis:
     """φ_d(s) = exp(−½ Σⱼ δⱼ²/bⱼ²) around centre d; δⱼ a difference, or a chord where dimension j is periodic.
 
     Attributes:
-      centres: shape (D, S).
-      bandwidths: b > 0 in the units of the observation, shape (S,); a dimension of bandwidth zero is left out.
-      period: shape (S,), infinite where not periodic.
-      normalised: whether φ is divided by its sum. A linear function of it then goes on beyond the centres with the
-        value of the nearest ones, where plain radial basis functions fall to zero.
+      bandwidths: b in the units of the observation; a dimension of bandwidth zero is left out.
+      period: infinite where not periodic.
+      normalised: whether φ is divided by its sum. A linear function of it then keeps the value of the nearest centres
+        beyond them, where plain radial basis functions fall to zero.
     """
 
-    centres: np.ndarray
-    bandwidths: np.ndarray
-    period: np.ndarray
+    centres: Float[np.ndarray, "d s"]
+    bandwidths: Float[np.ndarray, " s"]
+    period: Float[np.ndarray, " s"]
     normalised: bool = False
 
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Features of observations of shape (N, S); shape (N, D)."""
-        observations = _vectors("observations", observations, self.centres.shape[1])
+    def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n d"]:
+        """Features of N observations, shape (N, S)."""
+        observations = matrix("observations", observations, columns=self.centres.shape[1])
         return radial_basis(observations, self.centres, self.bandwidths, self.period, normalised=self.normalised)
 
     def rescaled(self, multiples: ArrayLike) -> Self:
@@ -72,30 +75,30 @@ class RadialBasis:
 
 @dataclass(frozen=True, eq=False)
 class JointRadialBasis:
-    """φ_d(s, a) = state kernel × action kernel at the joint centre d (specification, section 8).
+    """φ_d(s, a) = state kernel × action kernel, both at centre d.
 
     Actions are clipped to [low, high], as the environment does, and divided by their range.
 
     Attributes:
-      states: the state kernel, with D centres.
-      action_centres: in the action's units, inside the bounds; shape (D, A).
-      action_bandwidths: as fractions of the range, shape (A,).
-      action_low, action_high: shape (A,); infinite where the space has no bound.
-      action_range: high − low, or what stands for it in an unbounded dimension; shape (A,).
+      states: the state kernel.
+      action_centres: in the action's units, inside the bounds.
+      action_bandwidths: as fractions of the range.
+      action_low, action_high: infinite where the space has no bound.
+      action_range: high − low; in an unbounded dimension four standard deviations of the observed actions.
     """
 
     states: RadialBasis
-    action_centres: np.ndarray
-    action_bandwidths: np.ndarray
-    action_low: np.ndarray
-    action_high: np.ndarray
-    action_range: np.ndarray
+    action_centres: Float[np.ndarray, "d a"]
+    action_bandwidths: Float[np.ndarray, " a"]
+    action_low: Float[np.ndarray, " a"]
+    action_high: Float[np.ndarray, " a"]
+    action_range: Float[np.ndarray, " a"]
 
-    def __call__(self, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Features of N pairs, observations (N, S) and actions (N, A); shape (N, D)."""
+    def __call__(self, observations: ArrayLike, actions: ArrayLike) -> Float[np.ndarray, "n d"]:
+        """Features of N pairs, observations (N, S) and actions (N, A)."""
         states, kernel = self.states, self.action_bandwidths * self.action_range
-        observations = _vectors("observations", observations, states.centres.shape[1])
-        actions = _vectors("actions", actions, self.action_centres.shape[1])
+        observations = matrix("observations", observations, columns=states.centres.shape[1])
+        actions = matrix("actions", actions, columns=self.action_centres.shape[1])
         if len(observations) != len(actions):
             raise ValueError(f"actions: expected {len(observations)} rows, one an observation, got {len(actions)}")
         clipped = np.clip(actions, self.action_low, self.action_high)
@@ -109,99 +112,107 @@ class JointRadialBasis:
 
 @dataclass(frozen=True, eq=False)
 class StateActionProduct:
-    """φ(s, a) = φ(s) ⊗ e_a for discrete actions; one-hot (s, a), column s·A + a, where φ(s) is one-hot."""
+    """φ(s, a) = φ(s) ⊗ e_a for discrete actions; column d·A + a holds φ_d(s)·1[action = a]."""
 
     state_features: StateFeatures
     number_of_actions: int
 
-    def __call__(self, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Features of N state-action pairs; shape (N, D·A), column d·A + a holding φ_d(s)·1[action = a]."""
+    def __call__(self, observations: Shaped[np.ndarray, "n ..."], actions: ArrayLike) -> Float[np.ndarray, "n da"]:
+        """Features of N pairs."""
         states = self.state_features(observations)
         chosen = OneHot(self.number_of_actions)(actions)
         return (states[:, :, None] * chosen[:, None, :]).reshape(len(states), -1)
 
 
+@dataclass(frozen=True, eq=False)
+class RadialBasisOptions:
+    """How radial basis functions are drawn at observed samples.
+
+    Attributes:
+      centres: how many, drawn without replacement; at most one a sample is.
+      bandwidth_factor: multiplies the median rule.
+      period: of each observation dimension, infinite where not periodic; None for none.
+      normalised: as of `RadialBasis`; for φ(s) alone.
+    """
+
+    centres: int
+    bandwidth_factor: float = 1.0
+    period: ArrayLike | None = None
+    normalised: bool = False
+
+    def __post_init__(self) -> None:
+        whole("centres", self.centres)
+        positive("bandwidth_factor", self.bandwidth_factor)
+
+    def state_kernel(
+        self, states: Float[np.ndarray, "n s"], rng: np.random.Generator
+    ) -> tuple[RadialBasis, Int[np.ndarray, " d"]]:
+        """Functions at some of `states`, and the rows that were drawn."""
+        if len(states) == 0:
+            raise ValueError("states: expected at least one row, got none")
+        chosen = rng.choice(len(states), size=min(self.centres, len(states)), replace=False)
+        bandwidths = median_bandwidths(states, factor=self.bandwidth_factor, period=self.period, rng=rng)
+        period = as_periods(self.period, states.shape[1])
+        return RadialBasis(states[chosen], bandwidths, period, self.normalised), chosen
+
+
 def draw_state_features(
-    observation_space: Space,
-    states: np.ndarray,
-    *,
-    rng: np.random.Generator,
-    number_of_centres: int,
-    bandwidth_factor: float = 1.0,
-    period: ArrayLike | None = None,
-    normalised: bool = False,
+    observation_space: Space[Any], states: ArrayLike, options: RadialBasisOptions, *, rng: np.random.Generator
 ) -> OneHot | RadialBasis:
     """φ(s) for a space: one-hot where it is `Discrete`, else radial basis functions at observed states.
 
     Args:
       states: observed states, shape (N, S), or (N,) where discrete.
-      number_of_centres: D, drawn without replacement; at most N are.
-      bandwidth_factor: multiple of the median rule.
-      period: of each dimension, infinite where not periodic; None for none.
-      normalised: as of `RadialBasis`.
+      options: of the radial basis functions.
     """
     if isinstance(observation_space, Discrete):
         return OneHot(int(observation_space.n))
-    states = _vectors("states", states, _box("observation_space", observation_space).shape[0])
-    centres = states[_without_replacement(len(states), number_of_centres, rng)]
-    bandwidths = median_bandwidths(states, factor=bandwidth_factor, period=period, rng=rng)
-    return RadialBasis(centres, bandwidths, as_periods(period, states.shape[1]), normalised)
+    states = matrix("states", states, columns=_box("observation_space", observation_space).shape[0])
+    return options.state_kernel(states, rng)[0]
 
 
 def draw_state_action_features(
-    observation_space: Space,
-    action_space: Space,
-    states: np.ndarray,
-    actions: np.ndarray,
+    observation_space: Space[Any],
+    action_space: Space[Any],
+    states: ArrayLike,
+    actions: ArrayLike,
+    options: RadialBasisOptions,
     *,
     rng: np.random.Generator,
-    number_of_centres: int,
-    bandwidth_factor: float = 1.0,
-    action_bandwidth: float = 0.5,
-    period: ArrayLike | None = None,
 ) -> JointRadialBasis | StateActionProduct:
     """φ(s, a) for two spaces: joint radial basis functions, or φ(s) ⊗ e_a where actions are `Discrete`.
 
     Args:
       states, actions: observed pairs, shapes (N, S) and (N, A), or (N,) where discrete.
-      number_of_centres, bandwidth_factor, period: as of `draw_state_features`.
-      action_bandwidth: of the action kernel, as a fraction of the action's range, > 0.
+      options: of the radial basis functions, not normalised.
     """
+    if options.normalised:
+        raise ValueError("normalised: expected False for features of states and actions, got True")
     if isinstance(action_space, Discrete):
-        features = draw_state_features(
-            observation_space,
-            states,
-            rng=rng,
-            number_of_centres=number_of_centres,
-            bandwidth_factor=bandwidth_factor,
-            period=period,
-        )
+        features = draw_state_features(observation_space, states, options, rng=rng)
         return StateActionProduct(features, int(action_space.n))
-    if not action_bandwidth > 0:
-        raise ValueError(f"action_bandwidth: expected a number > 0, got {action_bandwidth}")
     box = _box("action_space", action_space)
-    states = _vectors("states", states, _box("observation_space", observation_space).shape[0])
-    actions = _vectors("actions", actions, box.shape[0])
+    states = matrix("states", states, columns=_box("observation_space", observation_space).shape[0])
+    actions = matrix("actions", actions, columns=box.shape[0])
     if len(states) != len(actions):
         raise ValueError(f"actions: expected {len(states)} rows, one a state, got {len(actions)}")
-    chosen = _without_replacement(len(states), number_of_centres, rng)
-    bandwidths = median_bandwidths(states, factor=bandwidth_factor, period=period, rng=rng)
+    kernel, chosen = options.state_kernel(states, rng)
     low, high = box.low.astype(np.float64), box.high.astype(np.float64)
     bounded = np.isfinite(high) & np.isfinite(low)
     spread = 4 * actions.std(axis=0)  # stands for the range where a space has none
     width = np.where(bounded, np.where(bounded, high, 1.0) - np.where(bounded, low, 0.0), spread)
     return JointRadialBasis(
-        states=RadialBasis(states[chosen], bandwidths, as_periods(period, states.shape[1])),
+        states=kernel,
         action_centres=np.clip(actions[chosen], low, high),
-        action_bandwidths=np.full(box.shape[0], action_bandwidth),
+        action_bandwidths=np.full(box.shape[0], ACTION_BANDWIDTH),
         action_low=low,
         action_high=high,
         action_range=width,
     )
 
 
-def checked_features(features: StateFeatures, states: np.ndarray) -> np.ndarray:
-    """`features(states)` as float64 of shape (N, D); `ValueError`, naming what came, unless it is that and finite."""
+def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."]) -> Float[np.ndarray, "n d"]:
+    """`features(states)` as finite float64 numbers of shape (N, D); `ValueError` where it is anything else."""
     name = getattr(features, "__name__", type(features).__name__)
     values = np.asarray(features(states))
     if values.ndim != 2 or len(values) != len(states) or values.shape[1] == 0:
@@ -215,24 +226,7 @@ def checked_features(features: StateFeatures, states: np.ndarray) -> np.ndarray:
     return values
 
 
-def _vectors(name: str, values: np.ndarray, dimension: int) -> np.ndarray:
-    values = np.asarray(values, dtype=np.float64)
-    if values.ndim != 2 or values.shape[1] != dimension:
-        raise ValueError(f"{name}: expected shape (N, {dimension}), got {values.shape}")
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
-    return values
-
-
-def _box(name: str, space: Space) -> Box:
+def _box(name: str, space: Space[Any]) -> Box:
     if not isinstance(space, Box) or len(space.shape) != 1:
         raise ValueError(f"{name}: expected a Discrete space or a Box of shape (n,), got {space}")
     return space
-
-
-def _without_replacement(number: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
-    if wanted < 1:
-        raise ValueError(f"number_of_centres: expected at least 1, got {wanted}")
-    if number < 1:
-        raise ValueError("states: expected at least one row, got none")
-    return rng.choice(number, size=min(wanted, number), replace=False)

@@ -12,7 +12,13 @@ from bayespbrl import events, queries, rollouts
 from bayespbrl.envs.opening import as_given, environment_attribute, environment_name, given_by_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
-from bayespbrl.features import StateActionFeatures, checked_features, draw_state_action_features, draw_state_features
+from bayespbrl.features import (
+    RadialBasisOptions,
+    StateActionFeatures,
+    checked_features,
+    draw_state_action_features,
+    draw_state_features,
+)
 from bayespbrl.improvement import schedules
 from bayespbrl.improvement import update as improvement
 from bayespbrl.policies.choice import initial_policy
@@ -380,10 +386,8 @@ class Learner:
             self.environment.action_space,
             steps.states,
             steps.actions,
+            RadialBasisOptions(self.settings.centres, self.settings.bandwidth_factor, self._period),
             rng=rng,
-            number_of_centres=self.settings.centres,
-            bandwidth_factor=self.settings.bandwidth_factor,
-            period=self._period,
         )
 
     def _step_utilities(self, estimate: Any, steps: Transitions) -> tuple[np.ndarray, np.ndarray | None]:
@@ -416,11 +420,8 @@ class Learner:
         return draw_state_features(
             self.environment.observation_space,
             observed,
+            RadialBasisOptions(self.settings.centres, bandwidth_factor, self._period, normalised),
             rng=rng,
-            number_of_centres=self.settings.centres,
-            bandwidth_factor=bandwidth_factor,
-            period=self._period,
-            normalised=normalised,
         )
 
     @property

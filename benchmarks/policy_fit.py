@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from scipy.optimize import brentq
 
-from bayespbrl.features import draw_state_action_features, draw_state_features
+from bayespbrl.features import RadialBasisOptions, draw_state_action_features, draw_state_features
 from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, sample_actions
 
 KL_BOUND = 0.35
@@ -68,8 +68,9 @@ def seeded_fit(policy: Any, seed: int, *samples: np.ndarray, **options: Any) -> 
 
 def features_row(number: int, repeats: int, rng: np.random.Generator) -> None:
     states, actions = pendulum_states(number, rng), rng.uniform(-30, 30, (number, 1))
-    phi = draw_state_features(STATES, states, rng=rng, number_of_centres=700, period=PERIOD)
-    joint = draw_state_action_features(STATES, TORQUE, states, actions, rng=rng, number_of_centres=700, period=PERIOD)
+    options = RadialBasisOptions(700, period=PERIOD)
+    phi = draw_state_features(STATES, states, options, rng=rng)
+    joint = draw_state_action_features(STATES, TORQUE, states, actions, options, rng=rng)
     state_seconds, _ = timed(lambda: phi(states), repeats)
     joint_seconds, _ = timed(lambda: joint(states, actions), repeats)
     print(f"{number:6d}  φ(s), D = 700: {state_seconds:.3f} s   φ(s, a), Q = 700: {joint_seconds:.3f} s", flush=True)

@@ -12,6 +12,7 @@ from bayespbrl.features import (
     JointRadialBasis,
     OneHot,
     RadialBasis,
+    RadialBasisOptions,
     StateActionProduct,
     checked_features,
     draw_state_action_features,
@@ -96,7 +97,7 @@ def test_the_traceable_row_equals_the_matrix():
 def test_a_constant_dimension_is_left_out():
     rng = np.random.default_rng(3)
     states = np.column_stack([rng.normal(size=200), np.full(200, 7.0)])
-    features = draw_state_features(STATES, states, rng=rng, number_of_centres=20)
+    features = draw_state_features(STATES, states, RadialBasisOptions(20), rng=rng)
     assert features.bandwidths[1] == 0.0
     moved = states + np.array([0.0, 1.0])
     np.testing.assert_array_equal(features(states), features(moved))
@@ -128,16 +129,16 @@ def test_median_rule_of_a_mostly_constant_dimension_is_not_zero():
 def test_centres_are_observed_states_without_repetition():
     rng = np.random.default_rng(5)
     states = swinging_states(100, rng)
-    features = draw_state_features(STATES, states, rng=rng, number_of_centres=60, period=PERIOD)
+    features = draw_state_features(STATES, states, RadialBasisOptions(60, period=PERIOD), rng=rng)
     assert len(np.unique(features.centres, axis=0)) == 60
     assert {tuple(c) for c in features.centres} <= {tuple(s) for s in states}
-    assert draw_state_features(STATES, states, rng=rng, number_of_centres=700).centres.shape == (100, 2)
+    assert draw_state_features(STATES, states, RadialBasisOptions(700), rng=rng).centres.shape == (100, 2)
 
 
 def test_the_same_generator_draws_the_same_features():
     states = swinging_states(100, np.random.default_rng(6))
     one, two = (
-        draw_state_features(STATES, states, rng=np.random.default_rng(7), number_of_centres=9)(states) for _ in "ab"
+        draw_state_features(STATES, states, RadialBasisOptions(9), rng=np.random.default_rng(7))(states) for _ in "ab"
     )
     np.testing.assert_array_equal(one, two)
 
@@ -145,19 +146,17 @@ def test_the_same_generator_draws_the_same_features():
 def test_joint_features_are_the_product_of_a_state_and_an_action_kernel():
     rng = np.random.default_rng(8)
     states, actions = swinging_states(300, rng), rng.uniform(-30, 30, (300, 1))
-    joint = draw_state_action_features(
-        STATES, TORQUE, states, actions, rng=rng, number_of_centres=25, action_bandwidth=0.25, period=PERIOD
-    )
+    joint = draw_state_action_features(STATES, TORQUE, states, actions, RadialBasisOptions(25, period=PERIOD), rng=rng)
     assert isinstance(joint, JointRadialBasis)
-    # 0.25 of the range of 60 is a bandwidth of 15
-    action_kernel = np.exp(-0.5 * np.square((actions - joint.action_centres.T) / 15))
+    # half of the range of 60 is a bandwidth of 30
+    action_kernel = np.exp(-0.5 * np.square((actions - joint.action_centres.T) / 30))
     np.testing.assert_allclose(joint(states, actions), joint.states(states) * action_kernel, rtol=1e-11)
 
 
 def test_joint_features_clip_actions_as_the_environment_does():
     rng = np.random.default_rng(9)
     states, actions = swinging_states(50, rng), 100 * rng.normal(size=(50, 1))
-    joint = draw_state_action_features(STATES, TORQUE, states, actions, rng=rng, number_of_centres=10)
+    joint = draw_state_action_features(STATES, TORQUE, states, actions, RadialBasisOptions(10), rng=rng)
     assert np.abs(joint.action_centres).max() <= 30
     np.testing.assert_array_equal(joint(states, actions), joint(states, np.clip(actions, -30, 30)))
 
@@ -166,7 +165,7 @@ def test_joint_features_of_an_unbounded_action_follow_its_observed_spread():
     rng = np.random.default_rng(10)
     states, actions = swinging_states(500, rng), 7 * rng.normal(size=(500, 1))
     joint = draw_state_action_features(
-        STATES, Box(-np.inf, np.inf, (1,)), states, actions, rng=rng, number_of_centres=10
+        STATES, Box(-np.inf, np.inf, (1,)), states, actions, RadialBasisOptions(10), rng=rng
     )
     assert joint.action_range[0] == pytest.approx(28, rel=0.1)
 
@@ -181,7 +180,7 @@ def test_features_are_dataclasses_of_arrays_and_numbers(observation_space, actio
     states = rng.integers(6, size=40) if discrete else swinging_states(40, rng)
     actions = rng.integers(3, size=40) if isinstance(action_space, Discrete) else rng.normal(size=(40, 1))
     features = draw_state_action_features(
-        observation_space, action_space, states, actions, rng=rng, number_of_centres=8
+        observation_space, action_space, states, actions, RadialBasisOptions(8), rng=rng
     )
     assert features(states, actions).shape == {"Box": (40, 8)}.get(
         type(action_space).__name__, (40, 18 if discrete else 24)
@@ -200,7 +199,7 @@ def test_features_are_dataclasses_of_arrays_and_numbers(observation_space, actio
 def test_seven_hundred_features_of_24000_states_are_quick():
     rng = np.random.default_rng(12)
     states = swinging_states(24_000, rng)
-    features = draw_state_features(STATES, states, rng=rng, number_of_centres=700, period=PERIOD)
+    features = draw_state_features(STATES, states, RadialBasisOptions(700, period=PERIOD), rng=rng)
     seconds = []
     for _ in range(3):
         start = time.perf_counter()
@@ -235,10 +234,21 @@ def test_good_user_features_pass_as_float64():
     [
         (lambda r: OneHot(3)(np.array([3])), "expected states in 0 … 2"),
         (lambda r: OneHot(3)(np.array([0.5])), "expected integers"),
-        (lambda r: draw_state_features(STATES, np.ones((4, 3)), rng=r, number_of_centres=2), r"shape \(N, 2\)"),
-        (lambda r: draw_state_features(STATES, np.full((4, 2), np.nan), rng=r, number_of_centres=2), "NaN"),
-        (lambda r: draw_state_features(STATES, np.ones((4, 2)), rng=r, number_of_centres=0), "number_of_centres"),
-        (lambda r: draw_state_features(Box(0, 1, (2, 2)), np.ones((4, 2)), rng=r, number_of_centres=1), "Box of shape"),
+        (lambda r: draw_state_features(STATES, np.ones((4, 3)), RadialBasisOptions(2), rng=r), r"shape \(N, 2\)"),
+        (lambda r: draw_state_features(STATES, np.full((4, 2), np.nan), RadialBasisOptions(2), rng=r), "NaN"),
+        (lambda r: draw_state_features(STATES, np.ones((0, 2)), RadialBasisOptions(2), rng=r), "states: .* got none"),
+        (lambda r: RadialBasisOptions(0), "centres: expected a whole number >= 1, got 0"),
+        (lambda r: RadialBasisOptions(3, bandwidth_factor=0.0), "bandwidth_factor: expected a positive .* got 0.0"),
+        (
+            lambda r: draw_state_action_features(
+                STATES, TORQUE, np.ones((4, 2)), np.ones((4, 1)), RadialBasisOptions(2, normalised=True), rng=r
+            ),
+            "normalised: expected False",
+        ),
+        (
+            lambda r: draw_state_features(Box(0, 1, (2, 2)), np.ones((4, 2)), RadialBasisOptions(1), rng=r),
+            "Box of shape",
+        ),
         (lambda r: median_bandwidths(np.ones((4, 2)), factor=0.0, rng=r), "factor"),
         (lambda r: median_bandwidths(np.ones((4, 2)), period=(1.0,), rng=r), "period: expected 2"),
         (lambda r: median_bandwidths(np.ones((4, 1)), period=(-1.0,), rng=r), "period: expected 1"),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from bayespbrl.features import OneHot, StateActionProduct, draw_state_action_features
+from bayespbrl.features import OneHot, RadialBasisOptions, StateActionProduct, draw_state_action_features
 from bayespbrl.improvement import q_function
 from bayespbrl.improvement import update as improvement
 from bayespbrl.policies import (
@@ -108,7 +108,7 @@ def test_q_is_the_same_however_many_transitions_are_taken_at_a_time(monkeypatch,
         utilities, space = rng.normal(size=len(steps)), Box(-1, 1, (1,))
         policy = LinearGaussianPolicy.initial(Box(-9, 9, (2,)), space)
         features = draw_state_action_features(
-            Box(-9, 9, (2,)), space, steps.states, steps.actions, rng=rng, number_of_centres=9
+            Box(-9, 9, (2,)), space, steps.states, steps.actions, RadialBasisOptions(9), rng=rng
         )
     else:
         (steps, utilities), space, policy = random_steps(terminated=True), Discrete(ACTIONS), random_policy()

@@ -1,0 +1,62 @@
+"""Checks of arguments, one for each kind: a `ValueError` says which argument it is, what was expected and what came."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+
+def whole(name: str, value: Any, least: int = 1) -> int:
+    """`value` as an int, where it is a whole number >= `least`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name}: expected a whole number >= {least}, got {value!r}")
+    return int(value)
+
+
+def positive(name: str, value: Any) -> float:
+    """`value` as a float, where it is finite and > 0."""
+    if not (_is_number(value) and value > 0):
+        raise ValueError(f"{name}: expected a positive finite number, got {value!r}")
+    return float(value)
+
+
+def non_negative(name: str, value: Any) -> float:
+    """`value` as a float, where it is finite and >= 0."""
+    if not (_is_number(value) and value >= 0):
+        raise ValueError(f"{name}: expected a non-negative finite number, got {value!r}")
+    return float(value)
+
+
+def share(name: str, value: Any, *, below_one: bool = False) -> float:
+    """`value` as a float, where it is in [0, 1], or in [0, 1)."""
+    if not (_is_number(value) and 0 <= value <= 1) or (below_one and value == 1):
+        raise ValueError(f"{name}: expected a number in [0, 1{')' if below_one else ']'}, got {value!r}")
+    return float(value)
+
+
+def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
+    """`value`, where it is one of `choices`."""
+    if value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+    return str(value)
+
+
+def finite(name: str, values: Any) -> None:
+    """That an array holds no NaN and no infinity."""
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
+
+
+def matrix(name: str, values: Any, *, columns: int | None = None) -> np.ndarray:
+    """`values` as a finite float64 array of shape (N, columns); any number of columns when None."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
+        raise ValueError(f"{name}: expected shape (N, {'D' if columns is None else columns}), got {array.shape}")
+    finite(name, array)
+    return array
+
+
+def _is_number(value: Any) -> bool:
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return number and math.isfinite(value)
