@@ -315,7 +315,7 @@ def test_of_two_learners_on_one_run_the_second_to_write_is_refused_and_nothing_i
     queries = first.ask()
     second.tell([expert(*query.trajectories) for query in second.ask()])
     kept = contents(tmp_path / "run")
-    with pytest.raises(ValueError, match="another one has gone on with it"):
+    with pytest.raises(ValueError, match="another learner has written to it"):
         first.tell([expert(*query.trajectories) for query in queries])
     assert contents(tmp_path / "run") == kept
     assert fingerprint(second.run(expert)) == straight
@@ -406,7 +406,7 @@ def test_a_log_that_has_lost_iterations_is_refused_and_nothing_is_written_over(c
         log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[:lines]))
     before = contents(copy)
     for read in (runs.resume, bayespbrl.load):
-        with pytest.raises(ValueError, match=r"expected the 3 completed iterations that summary.json tells of, got 0"):
+        with pytest.raises(ValueError, match=r"expected the 3 completed iterations of summary.json, got 0"):
             read(copy)
     assert contents(copy) == before
 

@@ -1,9 +1,9 @@
-"""The directory of a run: settings, an append-only log of events, one netCDF file an iteration, a summary.
+"""The directory of a run: settings, an append-only log of events, one netCDF file per iteration, a summary.
 
-settings.json         what the run was asked to do; the directory appears with it in one step
-events.jsonl          every question and every answer, flushed before the learner moves on
-iterations/0001.nc    trajectories, policy, utility estimate and posterior, renamed into place
-summary.json          one object for each completed iteration
+settings.json         the options of the run; the directory is created together with this file, in one step
+events.jsonl          every question and every answer, flushed to the disk before the learner moves on
+iterations/0001.nc    the iteration's trajectories, policy, utility estimate and posterior
+summary.json          the figures of each completed iteration
 """
 
 import json
@@ -18,24 +18,27 @@ from pathlib import Path
 from typing import Any
 
 from bayespbrl.events import Entry, LearnerState, surviving
+from bayespbrl.features import StateFeatures
 from bayespbrl.runs.files import write_file
 from bayespbrl.runs.iteration_files import read_iteration, write_iteration
 from bayespbrl.settings import Settings
 
-FORMAT = 2  # 1 named classes by their modules
+FORMAT = 2  # format 1 named classes by their modules
+HEAVY = ("collected", "improved")  # events with heavy parts, in the file of their iteration
+Event = dict[str, Any]
 
 
 class RunDirectory:
-    """The log of a run (see the module's first lines). Made by `create` or `open`."""
+    """A run directory, which is the learner's `Log`; `create` makes a new one, `open` finds an existing one."""
 
     def __init__(self, path: Path, settings: Settings):
         self.path = path
         self.settings = settings
-        self._end: int | None = None  # bytes of the log as this learner left it
+        self._end: int | None = None  # size of the log, in bytes, after this learner's last event
 
     @classmethod
     def create(cls, path: Path | str, settings: Settings) -> "RunDirectory":
-        """A new run directory, which appears at once with its settings in it.
+        """A new run directory. It appears together with its settings, or not at all.
 
         Raises:
           ValueError: the path exists, or cannot be written.
@@ -63,12 +66,12 @@ class RunDirectory:
 
     @classmethod
     def open(cls, path: Path | str) -> "RunDirectory":
-        """The run directory at `path`; `ValueError` if it is none or of a newer format."""
+        """The run directory at `path`; `ValueError` where that is no run, or one of another format."""
         path = Path(path)
         file = path / "settings.json"
         try:
             content = json.loads(file.read_text())
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        except (OSError, ValueError) as error:
             raise ValueError(f"{path}: expected a run directory with its settings.json, got {error}") from error
         if not isinstance(content, dict) or not isinstance(content.get("format"), int):
             raise ValueError(f"{file}: expected the settings of a run, got a foreign file")
@@ -86,20 +89,20 @@ class RunDirectory:
             raise ValueError(f"{file}: {error}") from error
 
     def append(self, entry: Entry, state: LearnerState) -> None:
-        """Keep one event: first its heavy parts, then its line, flushed to the disk.
+        """Write one event: first its heavy parts, then its line, flushed to the disk.
 
         Raises:
-          ValueError: another learner has gone on with the run in the meantime; nothing is written then.
+          ValueError: another learner has written to the run in the meantime; nothing is written then.
         """
         if self._end is not None and self._end != self._log_size():
             raise ValueError(
-                f"{self.path}: expected the run as this learner left it, but another one has gone on with it; "
-                "resume it to go on from there"
+                f"{self.path}: expected the run as this learner left it, but another learner has written to it; "
+                "resume the run to continue from there"
             )
         if entry.parts:
             write_iteration(self.iteration_file(entry.event["iteration"]), entry)
         line = (json.dumps(dict(entry.event), allow_nan=False) + "\n").encode()
-        with (self.path / "events.jsonl").open("ab", buffering=0) as file:
+        with self.log_file.open("ab", buffering=0) as file:
             before = file.tell()
             try:
                 if file.write(line) != len(line):
@@ -108,95 +111,86 @@ class RunDirectory:
                 if entry.event["event"] in ("improved", "undone"):
                     self.write_summary(state)
                 self._end = file.tell()
-            except BaseException:  # a full disk or Ctrl-C: the learner will not have moved on either
+            except BaseException:  # a full disk or Ctrl-C: the learner does not move on either
                 file.truncate(before)
                 raise
 
     def finished(self) -> bool:
-        """Whether the run has completed all its iterations, by its summary."""
+        """Whether all iterations are completed, according to `summary.json`."""
         return (self.path / "summary.json").exists() and bool(read_summary(self.path)["finished"])
 
-    def entries(self, *, features: Any = None, known: Sequence[type] = ()) -> Iterator[Entry]:
-        """The events so far, what was undone left out, with their heavy parts; neither is a last line cut off."""
+    def entries(self, *, features: StateFeatures | None = None, known: Sequence[type] = ()) -> Iterator[Entry]:
+        """The events so far with their heavy parts, without those undone and without a last line that is cut off.
+
+        Args:
+          features: φ(s) of the user's, where the run was started with it.
+          known: classes of the user's that the files may name.
+        """
         for event in surviving(self._events()):
             parts = {}
-            if event["event"] in ("collected", "improved"):
+            if event["event"] in HEAVY:
                 parts = read_iteration(
                     self.iteration_file(event["iteration"]), event["event"], features=features, known=known
                 )
             yield Entry(event, parts)
 
-    def _events(self) -> Iterator[dict[str, Any]]:
-        for number, line in enumerate(self._complete_lines(), start=1):
-            try:
-                event = json.loads(line)
-            except ValueError:
-                event = None
-            heavy = isinstance(event, dict) and event.get("event") in ("collected", "improved")
-            if (
-                not isinstance(event, dict)
-                or "event" not in event
-                or (heavy and type(event.get("iteration")) is not int)
-            ):
-                raise ValueError(f"events.jsonl, line {number}: expected an event, got {line[:60]!r}")
+    def _events(self) -> Iterator[Event]:
+        for event in read_log_lines(self.log_file):
+            if isinstance(event, PartialLine):
+                return
+            if isinstance(event, ValueError):
+                raise event
             yield event
 
     def summarised(self) -> int:
-        """How many iterations `summary.json` tells of; 0 where it cannot be read, for it is made anew from the log."""
+        """The number of iterations in `summary.json`; 0 where it cannot be read, since it is derived from the log."""
         try:
             return len(read_summary(self.path)["iterations"])
         except (ValueError, TypeError):
             return 0
 
-    def expect_whole(self, state: LearnerState, known: int) -> None:
-        """That the log is not shorter than the summary: who went on with it would write over what it lost.
+    def check_complete(self, state: LearnerState, summarised: int) -> None:
+        """Check that the log holds all iterations of the summary: a learner that continues would overwrite the others.
 
-        An event that was interrupted can leave the summary one iteration ahead, and one that takes an answer back more.
+        The summary may be one iteration ahead where an event was interrupted, and more where an undo was.
 
         Args:
-          state: by the log.
-          known: what was `summarised` before the log was read, for another process may be going on with the run.
+          state: the learner's, by the log.
+          summarised: as returned by `summarised` before the log was read; another process may continue the run.
 
         Raises:
           ValueError: iterations are missing from the log.
         """
-        if known <= state.iteration + 1:
+        if summarised <= state.iteration + 1:
             return
         if [event["event"] for event in self._events()][-1:] != ["undone"]:
             raise ValueError(
-                f"events.jsonl: expected the {known} completed iterations that summary.json tells of, "
-                f"got {state.iteration}"
+                f"events.jsonl: expected the {summarised} completed iterations of summary.json, got {state.iteration}"
             )
 
     def drop_partial_line(self) -> None:
-        """Cut off a last line that a killed process left half-written, so that the next event starts a new one."""
-        file = self.path / "events.jsonl"
-        if file.exists():
-            whole = file.read_bytes()
+        """Cut off a last line that a killed process left half-written, so that the next event starts a new line."""
+        if self.log_file.exists():
+            whole = self.log_file.read_bytes()
             complete = whole[: whole.rfind(b"\n") + 1]
             if complete != whole:
-                os.truncate(file, len(complete))
+                os.truncate(self.log_file, len(complete))
         self._end = self._log_size()
 
     def _log_size(self) -> int:
-        file = self.path / "events.jsonl"
-        return file.stat().st_size if file.exists() else 0
+        return self.log_file.stat().st_size if self.log_file.exists() else 0
 
-    def _complete_lines(self) -> list[str]:
-        file = self.path / "events.jsonl"
-        if not file.exists():
-            return []
-        try:
-            return file.read_text(encoding="utf-8").split("\n")[:-1]
-        except UnicodeDecodeError as error:
-            raise ValueError(f"events.jsonl: expected lines of JSON, got {error}") from error
+    @property
+    def log_file(self) -> Path:
+        """The append-only log of events."""
+        return self.path / "events.jsonl"
 
     def iteration_file(self, number: int) -> Path:
-        """Where the heavy parts of an iteration are kept."""
+        """The file with the heavy parts of an iteration."""
         return self.path / "iterations" / f"{number:04d}.nc"
 
     def write_summary(self, state: LearnerState) -> None:
-        """Write `summary.json` anew."""
+        """Write `summary.json`."""
         summary = {
             "env": self.settings.env,
             "utility": self.settings.utility,
@@ -208,12 +202,36 @@ class RunDirectory:
         write_file(self.path / "summary.json", json.dumps(summary, indent=1) + "\n")
 
 
+class PartialLine(ValueError):
+    """The last line of a log without its end, as a process killed while writing leaves it."""
+
+
+def read_log_lines(file: Path) -> list[Event | ValueError]:
+    """Each line of a log: an event, or an error that says which line is none. A missing log has no lines."""
+    if not file.exists():
+        return []
+    *lines, rest = file.read_bytes().split(b"\n")
+    events = [_event(number, line) for number, line in enumerate(lines, start=1)]
+    return events + [PartialLine("events.jsonl: the last line is cut off")] * bool(rest)
+
+
+def _event(number: int, line: bytes) -> Event | ValueError:
+    try:
+        event = json.loads(line.decode())
+    except ValueError:
+        event = None
+    named = isinstance(event, dict) and "event" in event
+    if named and (event["event"] not in HEAVY or type(event.get("iteration")) is int):
+        return dict(event)
+    return ValueError(f"events.jsonl, line {number}: expected an event, got {line.decode(errors='replace')[:60]!r}")
+
+
 def read_summary(directory: Path | str) -> dict[str, Any]:
     """`summary.json` of a run; `ValueError` if it is missing, truncated or foreign."""
     file = Path(directory) / "summary.json"
     try:
         summary = json.loads(file.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise ValueError(f"{file}: expected the summary of a run, got {error}") from error
     if not isinstance(summary, dict) or not {"seed", "finished", "iterations"} <= set(summary):
         raise ValueError(f"{file}: expected the summary of a run, got a foreign file")
@@ -221,7 +239,7 @@ def read_summary(directory: Path | str) -> dict[str, Any]:
 
 
 def fresh_directory(env: str) -> Path:
-    """A path under `runs/` that does not exist yet, named by environment and time."""
+    """A path under `runs/` that does not exist yet, named after the environment and the time."""
     stem = f"{env.replace('/', '-').lower()}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
     path, count = Path("runs") / stem, 1
     while path.exists():

@@ -91,7 +91,7 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
             raise ValueError(f"{log.path}: a run {had} {part} of the user's own: expected {expected} {part}=")
     if settings.environment == "other" and env is None:
         raise ValueError(f"{log.path}: a run with an environment of the user's own: expected it again as env=")
-    known = log.summarised()
+    summarised = log.summarised()
     try:
         learner = Learner(
             settings.env if env is None else env,
@@ -101,7 +101,7 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
             entries=log.entries(features=features, known=() if policy is None else (type(policy),)),
             kept=settings,
         )
-        log.expect_whole(learner.state, known)
+        log.check_complete(learner.state, summarised)
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
     return learner
