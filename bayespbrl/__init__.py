@@ -6,7 +6,7 @@ from bayespbrl.preferences import Answer, Preferences, Query
 from bayespbrl.runs.run import Run, load, resume, start
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility.estimate import infer_utility
+from bayespbrl.utility import infer_utility
 
 __all__ = [
     "Answer",

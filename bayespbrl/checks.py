@@ -57,6 +57,21 @@ def matrix(name: str, values: Any, *, columns: int | None = None) -> np.ndarray:
     return array
 
 
+def index(name: str, value: Any, number: int) -> int:
+    """`value` as an int, where it is one of 0 … `number` − 1."""
+    if not isinstance(value, int | np.integer) or not 0 <= value < number:
+        raise ValueError(f"{name}: expected a number in 0 … {number - 1}, got {value!r}")
+    return int(value)
+
+
+def flags(name: str, values: Any, number: int) -> np.ndarray:
+    """`values` as an array, where it is bool of shape (`number`,)."""
+    array = np.asarray(values)
+    if array.shape != (number,) or array.dtype != bool:
+        raise ValueError(f"{name}: expected bool of shape ({number},), got {array.dtype} of shape {array.shape}")
+    return array
+
+
 def _is_number(value: Any) -> bool:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     return number and math.isfinite(value)

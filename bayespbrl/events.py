@@ -17,8 +17,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from bayespbrl.improvement.schedules import Bound
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
 from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility.estimate import UtilityEstimate
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class LearnerState:
     Attributes:
       policy: the current policy.
       estimate: the last utility estimate; None before the first.
+      bound: the last decision on the KL bound; None before the first.
       iteration: iterations completed.
       trajectories: all of them, by number.
       preferences: the answers so far.
@@ -62,7 +65,8 @@ class LearnerState:
     """
 
     policy: Any
-    estimate: Any = None
+    estimate: UtilityEstimate | None = None
+    bound: Bound | None = None
     iteration: int = 0
     trajectories: tuple[Trajectory, ...] = ()
     preferences: Preferences = field(default_factory=Preferences)
@@ -101,6 +105,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
                 state,
                 policy=entry.parts["policy"],
                 estimate=entry.parts["estimate"],
+                bound=Bound.recalled(event["summary"]["kl_bound"], event["summary"]["schedule"]),
                 iteration=operator.index(event["iteration"]),
                 collected=False,
                 candidates=(),
@@ -124,7 +129,7 @@ def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
     for entry in entries:
         try:
             state = apply(state, entry)
-        except (KeyError, TypeError, IndexError) as error:
+        except (KeyError, TypeError, IndexError, AttributeError) as error:
             reason = f"{type(error).__name__} {error}"
             raise ValueError(f"event: expected a complete one, got {dict(entry.event)} ({reason})") from error
     return state

@@ -15,49 +15,47 @@ from bayespbrl.experts import Expert
 from bayespbrl.features import (
     RadialBasisOptions,
     StateActionFeatures,
+    StateFeatures,
     checked_features,
     draw_state_action_features,
     draw_state_features,
 )
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement import update as improvement
+from bayespbrl.improvement.problem import UpdateProblem, states_of_update, step_utilities
+from bayespbrl.improvement.schedules import Bound, Situation
+from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.policies.choice import initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
+from bayespbrl.queries import QuerySituation
 from bayespbrl.settings import Settings, settings_for
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
-from bayespbrl.utility import averaging
-from bayespbrl.utility import estimate as utility
-from bayespbrl.utility import hyperparameters as evidence
+from bayespbrl.utility.comparisons import Comparisons
+from bayespbrl.utility.estimate import UtilityEstimate
+from bayespbrl.utility.hyperparameters import HyperparameterChoice
+from bayespbrl.utility.inference import estimate
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
 COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED = range(8)
-# Posterior draws that a rule for questions looks at: enough to order ten candidates, in hundredths of a second.
-QUERY_DRAWS = 500
-# And a schedule, for which every draw costs a column of LSTD: the spread of a gain is known within a tenth of itself.
+# Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
-# From this signal of the schedule `confidence` on, `information-when-unsure` asks as the paper does. Chosen on the
-# SwingUp, seeds 100-119, all levers, always three updates an iteration, each with the spread fitted anew: the lower
-# quartile is at 0.95 of the relative value at answer 8 with 0.75 and where information is asked for always, at 11 with
-# 0.6. With the spread held, as it is now, and with one update only this one value was tried.
-SURE_SIGNAL = 0.75
-# From this signal on an iteration may ask nothing, as `unasked_iterations` says; chosen in RESULTS.md, "Asking less".
-UNASKED_SIGNAL = 0.5
+UNASKED_SIGNAL = 0.5  # from this signal on an iteration may ask nothing
 
 
 class Learner:
     """Learns a policy from answers to "which of these two trajectories is better?".
 
     `ask()` returns the questions that wait for an answer, `tell(answers)` moves on; `run(expert)` is a loop over the
-    two. Whatever happens is appended to a log first, and the state is a fold over that log.
+    two. Every event is appended to a log first, and the state is a fold over that log.
 
     Args:
       env: a short name (`gridworld`, …), a gymnasium id, or an environment.
-      features: φ of your own, from observations (N, S) to (N, D); drawn by the settings when None.
-      policy: a kind of policy by name, as of `Settings`, or a first policy of your own.
-      schedule: of the KL bound by name, as of `Settings`, or one of your own (`bayespbrl.improvement.schedules`).
+      features: φ of your own, from observations (N, S) to (N, D); None: drawn as the settings say.
+      policy: a kind of policy by name, or a first policy of your own.
+      schedule: of the KL bound by name, or one of your own (`bayespbrl.improvement.schedules`).
+      query: the rule for questions by name, or one of your own (`bayespbrl.queries`).
       entries: events of a run to continue.
       kept: the settings of that run, which hold then as they are.
-      **settings: options of `Settings`, over the preset of the environment.
+      **options: those of `Settings`, named alone, over the preset of the environment.
 
     Raises:
       ValueError: an unknown environment or option, a value out of range, or no time limit known.
@@ -67,36 +65,39 @@ class Learner:
         self,
         env: Any,
         *,
-        features: utility.StateFeatures | None = None,
+        features: StateFeatures | None = None,
         policy: Any = None,
         schedule: schedules.Schedule | str | None = None,
+        query: queries.QueryRule | str | None = None,
         entries: Iterable[Entry] = (),
         kept: Settings | None = None,
-        **settings: Any,
+        **options: Any,
     ):
         self.environment = rollouts.open_environment(env)
         self.given = env if isinstance(env, gymnasium.Env) else as_given(self.environment)
-        if "environment" in settings:
+        if "environment" in options:
             raise ValueError("settings: expected env alone to say which environment, got environment too")
         own_policy = None if policy is None or isinstance(policy, str) else policy
         self.settings: Settings = kept or settings_for(
             env if isinstance(env, str) else environment_name(self.environment),
             policy=policy if own_policy is None else "other",
-            features="drawn" if features is None else "other",
-            environment="named" if given_by_name(env) else "other",
+            features=None if features is None else "other",
+            environment=None if given_by_name(env) else "other",
             schedule="other" if callable(schedule) else schedule,
-            **settings,
+            query="other" if callable(query) else query,
+            **options,
         )
-        rollouts.step_limit(self.environment, self.settings.max_steps)  # or an error now, and not after the first step
+        rollouts.step_limit(self.environment, self.settings.rollouts.max_steps)  # an error now, not at the first step
         self.features = features
-        self.schedule = schedule if callable(schedule) else _schedule(self.settings.schedule)
+        self.schedule = _chosen("schedule", schedule, self.settings.update.schedule, schedules.SCHEDULES)
+        self.query_rule = _chosen("query", query, self.settings.questions.query, queries.QUERY_RULES)
         self.log: Log | None = None
         if own_policy is None:
             own_policy = initial_policy(
-                self.settings.policy,
+                self.settings.rollouts.policy,
                 self.environment.observation_space,
                 self.environment.action_space,
-                action_scale=self.settings.initial_action_scale,
+                action_scale=self.settings.rollouts.initial_action_scale,
                 period=self._period,
             )
         self.state = events.replay(LearnerState(own_policy), entries)
@@ -118,7 +119,7 @@ class Learner:
         return self.state.policy
 
     @property
-    def estimate(self) -> Any:
+    def estimate(self) -> UtilityEstimate | None:
         """The last utility estimate; None before the first."""
         return self.state.estimate
 
@@ -207,25 +208,32 @@ class Learner:
 
     def _collect(self) -> None:
         """Steps 3 and 4: new trajectories, and which of them to ask about."""
-        state, settings = self.state, self.settings
+        state, options, questions = self.state, self.settings.rollouts, self.settings.questions
         began = time.perf_counter()
         collected = rollouts.rollout(
             self.environment,
             state.policy,
             key=self._key(COLLECT, state.iteration),
-            episodes=settings.trajectories_per_iteration,
-            max_steps=settings.max_steps,
-            hold=settings.exploration_hold,
+            episodes=options.trajectories_per_iteration,
+            max_steps=options.max_steps,
+            hold=options.exploration_hold,
         )
-        numbers = range(len(state.trajectories), len(state.trajectories) + len(collected))
+        new = range(len(state.trajectories), len(state.trajectories) + len(collected))
+        rng = self._rng(CHOOSE, state.iteration)
+        wanted, candidates = 0, tuple[int, ...]()
         if state.estimate is None:
-            wanted = settings.first_queries
-            candidates = queries.random_candidates(numbers, rng=self._rng(CHOOSE, state.iteration))
-        elif self._can_do_without():
-            wanted, candidates = 0, ()
-        else:
-            wanted = settings.queries_per_iteration
-            candidates = self._candidates(numbers, collected)
+            wanted, candidates = questions.first_queries, queries.random_candidates(new, rng=rng)
+        elif not self._without_question():
+            situation = QuerySituation(
+                new,
+                (*state.trajectories, *collected),
+                state.shown,
+                state.preferences.undominated[-1],
+                state.estimate,
+                None if state.bound is None else state.bound.signal,
+                rng,
+            )
+            wanted, candidates = questions.queries_per_iteration, queries.candidates(self.query_rule, situation)
         event = {
             "event": "collected",
             "iteration": state.iteration + 1,
@@ -235,45 +243,17 @@ class Learner:
         }
         self._record(event, trajectories=collected)
 
-    def _can_do_without(self) -> bool:
-        """Whether an iteration asks nothing: `unasked_iterations` allows it, and what is known is enough to go on.
-
-        Where the schedule records no signal there is nothing to go by, and the setting alone decides.
-        """
-        state, last = self.state, self.state.summaries[-1]
-        # Decision: no more in a row than half the answers. What two or three of them say holds for a step or two; a
-        # policy that goes on by it narrows on what is wrong (RESULTS.md, "Asking little").
-        most = min(self.settings.unasked_iterations, state.preferences.answers // 2)
+    def _without_question(self) -> bool:
+        """Whether the next iteration asks nothing (`Questions.unasked_iterations`)."""
+        state = self.state
+        # Decision: at most half the answers so far. Draws from two or three answers agree even where they are wrong.
+        most = min(self.settings.questions.unasked_iterations, state.preferences.answers // 2)
         if state.unasked >= most or not state.preferences.pairs:
             return False
-        if "signal" not in last["schedule"]:
-            return True
-        signal = last["schedule"]["signal"]  # of a schedule of the user's own it may be anything
-        return isinstance(signal, int | float) and bool(last["utility_converged"]) and signal >= UNASKED_SIGNAL
-
-    def _candidates(self, numbers: Sequence[int], collected: Sequence[Trajectory]) -> tuple[int, ...]:
-        """As many trajectories as are new, in the order in which to ask about them."""
-        state, rule, number = self.state, self.settings.query, len(collected)
-        if rule == "information-when-unsure":
-            sure = state.summaries[-1]["schedule"].get("signal", 0.0) >= SURE_SIGNAL
-            rule = "highest-utility" if sure else "information"
-            if not sure:
-                everything = [*state.trajectories, *collected]
-                numbers = [i for i in range(len(everything)) if i not in state.shown]
-                collected = [everything[i] for i in numbers]
-        if rule == "highest-utility":
-            return queries.highest_utility_candidates(numbers, state.estimate.trajectory_utilities(collected))
-        shown = [*collected, state.trajectories[state.preferences.undominated[-1]]]
-        draws = state.estimate.trajectory_draws(shown, number=QUERY_DRAWS)
-        candidates = queries.posterior_candidates(
-            rule,
-            numbers,
-            draws[:, :-1],
-            draws[:, -1],
-            likelihood=state.estimate.likelihood,
-            rng=self._rng(CHOOSE, state.iteration),
-        )
-        return candidates[:number]
+        if state.bound is None or state.bound.signal is None:
+            return True  # without a signal the setting alone decides
+        converged = state.estimate is not None and state.estimate.quality.converged
+        return converged and state.bound.signal >= UNASKED_SIGNAL
 
     def _show(self) -> None:
         """Step 4: the next question, the best candidate against the newest of the undominated."""
@@ -287,97 +267,83 @@ class Learner:
 
     def _improve(self) -> None:
         """Steps 1 and 2, and the value of the new policy, which the learner does not see."""
-        state, settings = self.state, self.settings
+        state, options = self.state, self.settings.rollouts
         clock = [time.perf_counter()]
-        estimate, choice = self._estimate()
+        utility, choice = self._estimate()
         clock.append(time.perf_counter())
-        steps = transitions(state.trajectories)
-        update, bound = self._update(estimate, steps)
+        improved, bound = self._update(utility, transitions(state.trajectories))
         clock.append(time.perf_counter())
         evaluated = rollouts.returns(
             self.environment,
-            update.policy,
+            improved.policy,
             key=self._key(EVALUATE, 0),
-            episodes=settings.evaluation_episodes,
-            max_steps=settings.max_steps,
+            episodes=options.evaluation_episodes,
+            max_steps=options.max_steps,
         )
         clock.append(time.perf_counter())
         seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
-        summary = _summary(state, estimate, update, evaluated, seconds)
-        summary["schedule"] = {"reason": bound.reason, **bound.statistics}
-        summary["hyperparameters"] = None if choice is None else choice.summary()
-        size = settings.trajectories_per_iteration
+        summary = {
+            "iteration": state.iteration + 1,
+            "answers": state.preferences.answers,
+            "value": float(evaluated.total.mean()),
+            "terminated": float(evaluated.terminated.mean()),  # a share of the episodes
+            **utility.quality.summary(),
+            **improved.summary(),
+            "seconds": seconds,
+            "schedule": bound.summary(),
+            "hyperparameters": None if choice is None else choice.summary(),
+        }
         self._record(
             {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
-            trajectories=state.trajectories[-size:],
-            policy=update.policy,
-            estimate=estimate,
+            trajectories=state.trajectories[-options.trajectories_per_iteration :],
+            policy=improved.policy,
+            estimate=utility,
         )
 
-    def _estimate(self) -> tuple[Any, evidence.HyperparameterChoice | None]:
-        """Step 1, after the answers have said which length scales they speak for."""
-        settings, state = self.settings, self.state
-        pairs = state.preferences.pairs
-        features = self._state_features(
-            self._rng(FEATURES, 2 * state.iteration),
-            bandwidth_factor=settings.utility_bandwidth_factor,
-            normalised=settings.normalised_utility,
+    def _estimate(self) -> tuple[UtilityEstimate, HyperparameterChoice | None]:
+        """Step 1."""
+        state, settings = self.state, self.settings
+        rng = self._rng(FEATURES, 2 * state.iteration)
+        return estimate(
+            Comparisons.among(state.trajectories, state.preferences.pairs, discount=settings.trajectory_discount),
+            self._state_features(settings.features.of_utility(self._period), rng),
+            settings.estimation,
+            settings.model,
+            seed=int(self._rng(FIT, state.iteration).integers(2**31)),
         )
-        model: dict[str, Any] = {name: getattr(settings, name) for name in ("steepness", "lapse_rate")}
-        fixed: dict[str, Any] = {name: getattr(settings, name) for name in ("prior_scale", "likelihood")}
-        fixed["discount"] = settings.psi_discount
-        seed = int(self._rng(FIT, state.iteration).integers(2**31))
-        given, choice = {"features": features, **model}, None
-        if settings.hyperparameters != "given" and settings.utility != "known-reward":
-            choice = evidence.choose_hyperparameters(state.trajectories, pairs, features, **model, **fixed)
-            features = choice.features
-            model = {"steepness": choice.steepness, "lapse_rate": choice.lapse_rate}
-        estimate: Any = utility.estimate_utility(
-            state.trajectories,
-            pairs,
-            features,
-            method=settings.utility,
-            seed=seed,
-            **model,
-            **fixed,
-        )
-        if settings.hyperparameters == "averaged" and pairs:
-            estimate = averaging.average_utility(estimate, state.trajectories, pairs, seed=seed, **given, **fixed)
-        return estimate, choice
 
-    def _update(self, estimate: Any, steps: Any) -> tuple[improvement.Improvement, schedules.Bound]:
-        """Step 2, by as much as the schedule allows once it has seen what an update would do."""
+    def _update(self, utility: UtilityEstimate, steps: Transitions) -> tuple[Improvement, Bound]:
+        """Step 2: an update is proposed, the schedule decides on its bound, the update is applied."""
         settings, iteration = self.settings, self.state.iteration
-        rng = self._rng(FEATURES, 2 * iteration + 1)
+        rng, key = self._rng(FEATURES, 2 * iteration + 1), self._key(IMPROVE, iteration)
         state_action_features = self.state_action_features(steps, rng=rng)
-        utilities, utility_draws = self._step_utilities(estimate, steps)
-        decision: list[schedules.Bound] = []
-
-        def decide(update: improvement.ProposedUpdate) -> float:
-            situation = schedules.Situation(
-                iteration + 1, self.state.preferences.answers, settings.kl_bound, estimate, update
-            )
-            decision.append(schedules.decided(self.schedule, situation))
-            return decision[0].kl_bound
-
-        improved = improvement.improve(
-            self.state.policy,
+        constant = isinstance(self.schedule, schedules.ConstantBound)  # looks at no draws
+        utilities, draws = step_utilities(utility, steps, draws=0 if constant else SCHEDULE_DRAWS)
+        problem = UpdateProblem(
             steps,
             utilities,
-            key=self._key(IMPROVE, iteration),
-            rng=self._rng(IMPROVE, iteration),
-            action_space=self.environment.action_space,
-            state_features=self._state_features(rng, bandwidth_factor=settings.bandwidth_factor),
-            state_action_features=state_action_features,
-            kl_bound=decide,
-            updates=settings.updates_per_iteration,
-            discount=settings.discount,
-            fixed_point_ridge=settings.fixed_point_ridge,
-            projection_ridge=settings.projection_ridge,
-            visited=self._visited_states(),
-            utility_draws=utility_draws,
+            states_of_update(
+                self.state.trajectories,
+                settings.update,
+                an_iteration=settings.rollouts.trajectories_per_iteration,
+                rng=self._rng(VISITED, iteration),
+            ),
+            settings.critic,
+            state_action_features,
+            self._state_features(settings.features.of_critic(self._period), rng),
+            self.environment.action_space,
         )
-        return improved, decision[0]
+        proposed = propose(self.state.policy, problem, key=key, utility_draws=draws)
+        usual, answers = settings.update.kl_bound, self.state.preferences.answers
+        bound = schedules.decide(self.schedule, Situation(iteration + 1, answers, usual, utility, proposed))
+        improved = apply_update(
+            proposed,
+            bound.kl_bound,
+            key=key,
+            rng=self._rng(IMPROVE, iteration),
+            updates=settings.update.updates_per_iteration,
+        )
+        return improved, bound
 
     def state_action_features(self, steps: Transitions, *, rng: np.random.Generator) -> StateActionFeatures:
         """φ(s, a) of Q, drawn at observed transitions as the settings say."""
@@ -386,43 +352,17 @@ class Learner:
             self.environment.action_space,
             steps.states,
             steps.actions,
-            RadialBasisOptions(self.settings.centres, self.settings.bandwidth_factor, self._period),
+            self.settings.features.of_critic(self._period),
             rng=rng,
         )
 
-    def _step_utilities(self, estimate: Any, steps: Transitions) -> tuple[np.ndarray, np.ndarray | None]:
-        """uᵢ of each step, (N,), and under posterior draws, (N, S); None where no schedule asks or there are none."""
-        if isinstance(self.schedule, schedules.ConstantBound) or getattr(estimate, "posterior", None) is None:
-            return estimate.step_utilities(steps), None
-        utilities, draws = estimate.utilities_and_draws(steps.next_states, number=SCHEDULE_DRAWS)
-        return utilities, draws.T
-
-    def _visited_states(self) -> np.ndarray:
-        """States in which the last iterations acted: those of the policy update, and no more than the settings say."""
-        recent, size = self.settings.recent_iterations, self.settings.trajectories_per_iteration
-        trajectories = self.state.trajectories if recent is None else self.state.trajectories[-recent * size :]
-        states = np.concatenate([trajectory.states[:-1] for trajectory in trajectories])
-        if states.ndim == 1 or len(states) <= self.settings.update_states:
-            return states  # discrete ones are counted, not repeated
-        chosen = self._rng(VISITED, self.state.iteration).choice(
-            len(states), self.settings.update_states, replace=False
-        )
-        return states[np.sort(chosen)]
-
-    def _state_features(
-        self, rng: np.random.Generator, *, bandwidth_factor: float, normalised: bool = False
-    ) -> utility.StateFeatures:
+    def _state_features(self, options: RadialBasisOptions, rng: np.random.Generator) -> StateFeatures:
         """φ(s): the user's, or drawn anew at states observed so far."""
         if self.features is not None:
             features = self.features
             return lambda states: checked_features(features, states)
         observed = np.concatenate([trajectory.states for trajectory in self.state.trajectories])
-        return draw_state_features(
-            self.environment.observation_space,
-            observed,
-            RadialBasisOptions(self.settings.centres, bandwidth_factor, self._period, normalised),
-            rng=rng,
-        )
+        return draw_state_features(self.environment.observation_space, observed, options, rng=rng)
 
     @property
     def _period(self) -> Any:
@@ -445,45 +385,10 @@ class Learner:
         return jax.random.key(int(self._rng(purpose, count).integers(2**31)))
 
 
-def _schedule(name: str) -> schedules.Schedule:
-    if name not in schedules.SCHEDULES:
-        raise ValueError(f"schedule: expected a function of the user's own beside {name!r}, got none")
-    return schedules.SCHEDULES[name]
-
-
-def _summary(
-    state: LearnerState,
-    estimate: Any,
-    update: improvement.Improvement,
-    evaluated: rollouts.Returns,
-    seconds: dict[str, float],
-) -> dict[str, Any]:
-    """What an iteration reports, as plain data."""
-    quality, reps = estimate.quality, update.reps
-    return {
-        "iteration": state.iteration + 1,
-        "answers": state.preferences.answers,
-        "pairs": quality.pairs,
-        "pairs_satisfied": quality.pairs_satisfied,
-        "value": float(evaluated.total.mean()),
-        "terminated": float(evaluated.terminated.mean()),  # a share of the episodes
-        "kl_bound": reps.kl_bound,
-        "bound_active": reps.bound_active,
-        "kl": reps.kl,
-        "updates": update.updates,
-        "kl_fitted_policy": update.kl_fitted_policy,
-        "feature_gap": reps.feature_gap,
-        "feature_gap_raw": reps.feature_gap_raw,
-        "rank_kept": reps.rank_kept,
-        "effective_samples": reps.effective_samples,
-        "temperature": reps.temperature,
-        "reps_converged": reps.converged,
-        "entropy": update.entropy,
-        "action_standard_deviation": update.action_standard_deviation,
-        "rhat_max": quality.rhat_max,
-        "effective_sample_size_min": quality.effective_sample_size_min,
-        "utility_converged": quality.converged,
-        "utility_status": quality.status,
-        "log_evidence": quality.log_evidence,
-        "seconds": seconds,
-    }
+def _chosen(option: str, given: Any, name: str, known: Any) -> Any:
+    """The schedule or query rule: the user's own, or the known one of that name."""
+    if callable(given):
+        return given
+    if name not in known:
+        raise ValueError(f"{option}: expected a function of the user's own beside {name!r}, got none")
+    return known[name]

@@ -1,82 +1,188 @@
-"""Step 4: which of the new trajectories to show against the best so far.
+"""Step 4: which trajectories to ask about, and the question "this one or the best so far?" (paper, step 4).
 
-The paper's rule needs an estimate; the others need draws from its posterior. Each returns the new trajectories in order
-of preference: the first is asked about, the next when that question is skipped, or when more are asked.
+A query rule orders trajectories; the first is asked about, the next when that question is skipped or more are asked.
+Three lines make one of your own, for `Learner(query=...)`:
+
+    def newest(situation):
+        return sorted(situation.new, reverse=True)
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import entr
 
+from bayespbrl import checks
 from bayespbrl.models.likelihoods import Likelihood, prob
 from bayespbrl.preferences import Query
 from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility.estimate import UtilityEstimate
+
+# Posterior draws that a rule looks at: enough to order ten candidates, in hundredths of a second.
+QUERY_DRAWS = 500
+
+
+@dataclass(frozen=True)
+class Questions:
+    """How many questions are asked, and about which trajectories.
+
+    Attributes:
+      query: the rule that orders the trajectories, a name of `QUERY_RULES`; `other` is a rule of the user's.
+      queries_per_iteration, first_queries: M, in later iterations and in the first.
+      unasked_iterations: most iterations in a row without a question, at most half the answers so far (ties count),
+        once there is a preference. With a schedule that has a signal, only while the posterior has converged and the
+        signal is at least 0.5. The paper's is 0.
+    """
+
+    query: str = "highest-utility"
+    queries_per_iteration: int = 1
+    first_queries: int = 2
+    unasked_iterations: int = 0
+
+    def __post_init__(self) -> None:
+        checks.one_of("query", self.query, (*QUERY_RULES, "other"))
+        checks.whole("queries_per_iteration", self.queries_per_iteration)
+        checks.whole("first_queries", self.first_queries)
+        checks.whole("unasked_iterations", self.unasked_iterations, 0)
+
+
+@dataclass(frozen=True)
+class QuerySituation:
+    """What a query rule may look at.
+
+    Attributes:
+      new: numbers of this iteration's trajectories.
+      trajectories: all so far, by number, the new ones included.
+      shown: numbers of those that some question has shown.
+      incumbent: number of the newest undominated one, which a newcomer is compared with.
+      estimate: the utility estimate of the last iteration.
+      signal: of the last iteration's bound; None where the schedule has none.
+      rng: of everything random.
+    """
+
+    new: Sequence[int]
+    trajectories: Sequence[Trajectory]
+    shown: frozenset[int]
+    incumbent: int
+    estimate: UtilityEstimate
+    signal: float | None
+    rng: np.random.Generator
+
+    def draws(self) -> tuple[Float[np.ndarray, "s n"], Float[np.ndarray, " s"]]:
+        """Posterior draws of the utility of each new trajectory and of the incumbent."""
+        compared = [self.trajectories[number] for number in (*self.new, self.incumbent)]
+        draws = self.estimate.trajectory_draws(compared, number=QUERY_DRAWS)
+        return draws[:, :-1], draws[:, -1]
+
+
+QueryRule = Callable[[QuerySituation], Sequence[int]]
+
+
+@dataclass(frozen=True)
+class HighestUtility:
+    """The trajectory of highest expected utility wᵀψ(τ) first, equal ones in their order: the paper's rule."""
+
+    def __call__(self, situation: QuerySituation) -> list[int]:
+        new = [situation.trajectories[number] for number in situation.new]
+        order = np.argsort(-situation.estimate.trajectory_utilities(new), kind="stable")
+        return [situation.new[index] for index in order]
+
+
+@dataclass(frozen=True)
+class ProbablyBetter:
+    """The trajectory that is most probably better than the incumbent first."""
+
+    def __call__(self, situation: QuerySituation) -> list[int]:
+        utilities, incumbent = situation.draws()
+        return _ordered(situation, utilities, probability_better(utilities, incumbent))
+
+
+@dataclass(frozen=True)
+class Thompson:
+    """The trajectory of highest utility in one posterior draw first (Thompson 1933)."""
+
+    def __call__(self, situation: QuerySituation) -> list[int]:
+        utilities, _ = situation.draws()
+        return _ordered(situation, utilities, utilities[situation.rng.integers(len(utilities))])
+
+
+@dataclass(frozen=True)
+class Information:
+    """The comparison with the incumbent whose answer has the highest `expected_information` first."""
+
+    def __call__(self, situation: QuerySituation) -> list[int]:
+        utilities, incumbent = situation.draws()
+        scores = expected_information(utilities, incumbent, likelihood=situation.estimate.likelihood)
+        return _ordered(situation, utilities, scores)
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """The comparison with the incumbent that the draws disagree on most first: the variance of which is better."""
+
+    def __call__(self, situation: QuerySituation) -> list[int]:
+        utilities, incumbent = situation.draws()
+        better = probability_better(utilities, incumbent)
+        return _ordered(situation, utilities, better * (1 - better))
+
+
+@dataclass(frozen=True)
+class InformationWhenUnsure:
+    """`HighestUtility` while the signal is at least `sure`; else `Information` about any trajectory never shown."""
+
+    sure: float = 0.75
+
+    def __call__(self, situation: QuerySituation) -> list[int]:
+        if (situation.signal or 0.0) >= self.sure:
+            return HighestUtility()(situation)
+        never = [number for number in range(len(situation.trajectories)) if number not in situation.shown]
+        return Information()(replace(situation, new=never))
+
+
+QUERY_RULES: dict[str, QueryRule] = {
+    "highest-utility": HighestUtility(),
+    "probably-better": ProbablyBetter(),
+    "thompson": Thompson(),
+    "information": Information(),
+    "disagreement": Disagreement(),
+    "information-when-unsure": InformationWhenUnsure(),
+}
+
+
+def candidates(rule: QueryRule, situation: QuerySituation) -> tuple[int, ...]:
+    """The order of `rule`, checked, and cut to as many trajectories as are new.
+
+    Raises:
+      ValueError: no order, or one that names a trajectory that does not exist or names it twice.
+    """
+    order, known = rule(situation), len(situation.trajectories)
+    try:
+        numbers = [checks.whole("trajectory", number, 0) for number in order]
+    except (TypeError, ValueError):
+        numbers = []
+    if not numbers or len(set(numbers)) < len(numbers) or max(numbers) >= known:
+        name = getattr(rule, "__name__", type(rule).__name__)
+        raise ValueError(f"query rule {name}: expected different trajectory numbers below {known}, got {order!r}")
+    return tuple(numbers[: len(situation.new)])
 
 
 def random_candidates(numbers: Sequence[int], *, rng: np.random.Generator) -> tuple[int, ...]:
-    """`numbers` in random order: the first iteration, when there is no estimate yet to choose by (paper, step 4)."""
+    """`numbers` in random order: the first iteration, before there is an estimate to choose by (paper, step 4)."""
     return tuple(int(number) for number in rng.permutation(np.asarray(numbers)))
 
 
-def highest_utility_candidates(numbers: Sequence[int], utilities: np.ndarray) -> tuple[int, ...]:
-    """`numbers`, highest expected utility wᵀψ(τ) first (paper, step 4); equal ones in their order.
-
-    Args:
-      numbers: the n new trajectories.
-      utilities: expected utility of each, shape (n,).
-    """
-    if utilities.shape != (len(numbers),):
-        raise ValueError(f"utilities: expected one for each of {len(numbers)} trajectories, got {utilities.shape}")
-    return tuple(int(numbers[index]) for index in np.argsort(-utilities, kind="stable"))
+def _ordered(
+    situation: QuerySituation, utilities: Float[np.ndarray, "s n"], scores: Float[np.ndarray, " n"]
+) -> list[int]:
+    """The trajectories by score, equal ones by their mean utility."""
+    return [situation.new[index] for index in np.lexsort((-utilities.mean(axis=0), -scores))]
 
 
-def posterior_candidates(
-    rule: str,
-    numbers: Sequence[int],
-    utilities: np.ndarray,
-    incumbent: np.ndarray,
-    *,
-    likelihood: Likelihood,
-    rng: np.random.Generator,
-) -> tuple[int, ...]:
-    """`numbers` as a rule that looks at the posterior prefers them; equal ones by their mean utility.
-
-    `probably-better`: the probability of being better than the incumbent; `thompson`: the utility in one posterior
-    draw, which `rng` picks (Thompson 1933); `information`: `expected_information`; `disagreement`: the variance, over
-    draws, of which of the two is better.
-
-    Args:
-      rule: one of the four.
-      numbers: the n new trajectories.
-      utilities: S posterior draws of the utility of each, shape (S, n).
-      incumbent: the same draws of the utility of the best so far, shape (S,).
-      likelihood: of an answer given its margin, the difference of the two utilities.
-      rng: for `thompson`.
-
-    Raises:
-      ValueError: a rule there is not, or draws that do not fit or are not finite.
-    """
-    utilities, incumbent = _checked(utilities, incumbent)
-    if utilities.shape[1] != len(numbers):
-        raise ValueError(f"utilities: expected one for each of {len(numbers)} trajectories, got {utilities.shape}")
-    match rule:
-        case "probably-better":
-            scores = probability_better(utilities, incumbent)
-        case "thompson":
-            scores = utilities[rng.integers(len(utilities))]
-        case "information":
-            scores = expected_information(utilities, incumbent, likelihood=likelihood)
-        case "disagreement":
-            better = probability_better(utilities, incumbent)
-            scores = better * (1 - better)
-        case _:
-            expected = "probably-better, thompson, information or disagreement"
-            raise ValueError(f"query: expected {expected}, got {rule!r}")
-    return tuple(int(numbers[index]) for index in np.lexsort((-utilities.mean(axis=0), -scores)))
-
-
-def probability_better(utilities: np.ndarray, incumbent: np.ndarray) -> np.ndarray:
+def probability_better(
+    utilities: Float[np.ndarray, "s n"], incumbent: Float[np.ndarray, " s"]
+) -> Float[np.ndarray, " n"]:
     """Posterior probability that each of n trajectories is better than the incumbent; equal utilities count half.
 
     Args:
@@ -89,7 +195,9 @@ def probability_better(utilities: np.ndarray, incumbent: np.ndarray) -> np.ndarr
     return np.mean((1 + np.sign(utilities - incumbent[:, None])) / 2, axis=0)
 
 
-def expected_information(utilities: np.ndarray, incumbent: np.ndarray, *, likelihood: Likelihood) -> np.ndarray:
+def expected_information(
+    utilities: Float[np.ndarray, "s n"], incumbent: Float[np.ndarray, " s"], *, likelihood: Likelihood
+) -> Float[np.ndarray, " n"]:
     """What the answer to "this one or the incumbent?" is expected to tell about the utility, in nats, ≤ log 2.
 
     The mutual information of answer and weights, H(E p) − E H(p), with p the likelihood of the one answer at each draw

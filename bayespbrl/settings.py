@@ -1,293 +1,189 @@
-"""What a run was asked to do, as plain data: the options of a learner, checked, with a preset for each domain."""
+"""What a run was asked to do: the options of a learner, composed of those of its parts.
 
-import math
-from dataclasses import dataclass, fields, replace
+Users name an option alone: in keywords, on the command line, in `settings.json`. `OPTIONS` tells which part reads it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any
 
-UTILITIES = ("posterior-mean", "most-likely", "posterior-draw", "linear-program", "known-reward")
-WITHOUT_POSTERIOR = ("linear-program", "known-reward")
-QUERIES = ("highest-utility", "probably-better", "thompson", "information", "disagreement", "information-when-unsure")
-CHOICES = {
-    "utility": UTILITIES,
-    "likelihood": ("mixed", "logistic", "probit"),
-    "query": QUERIES,
-    "policy": ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other"),
-    "features": ("drawn", "other"),
-    "environment": ("named", "other"),
-    "schedule": ("constant", "confidence", "other"),
-    "hyperparameters": ("evidence", "given", "averaged"),
-    "expert": ("return", "terminal", "other"),
-}
-POSITIVE: Any = (lambda value: value > 0, "a positive finite number")
-NOT_NEGATIVE: Any = (lambda value: value >= 0, "a non-negative finite number")
-NUMBERS = {
-    **dict.fromkeys(("kl_bound", "prior_scale", "steepness", "initial_action_scale"), POSITIVE),
-    **dict.fromkeys(("bandwidth_factor", "utility_bandwidth_factor"), POSITIVE),
-    **dict.fromkeys(("fixed_point_ridge", "projection_ridge"), NOT_NEGATIVE),
-    **dict.fromkeys(("lapse_rate", "discount"), (lambda value: 0 <= value < 1, "a number in [0, 1)")),
-    "trajectory_discount": (lambda value: 0 <= value <= 1, "a number in [0, 1]"),
-    "wrong_answers": (lambda value: 0 <= value <= 1, "a share in [0, 1]"),
-}
-LEAST = {
-    "seed": 0,
-    "trajectories_per_iteration": 2,
-    "updates_per_iteration": 1,
-    "unasked_iterations": 0,
-    **dict.fromkeys(("iterations", "queries_per_iteration", "first_queries", "evaluation_episodes"), 1),
-    **dict.fromkeys(("centres", "update_states", "exploration_hold", "max_steps", "recent_iterations"), 1),
-}
-MAY_BE_NONE = ("trajectory_discount", "max_steps", "recent_iterations")
+from numpy.typing import ArrayLike
+
+from bayespbrl import checks
+from bayespbrl.features import RadialBasisOptions
+from bayespbrl.improvement.problem import PolicyUpdate
+from bayespbrl.improvement.q_function import Critic
+from bayespbrl.models import PreferenceModel
+from bayespbrl.presets import PRESETS
+from bayespbrl.queries import Questions
+from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
+
+POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
+
+
+@dataclass(frozen=True)
+class Features:
+    """How the features are drawn.
+
+    Attributes:
+      features: φ(s) as `drawn`: one-hot or radial basis functions at observed states; or `other`, a function of the
+        user's.
+      centres: radial basis functions of each kind of feature.
+      bandwidth_factor: multiplies the median rule for the features of Q and V.
+      utility_bandwidth_factor: multiplies the median rule for the utility's features.
+      normalised_utility: whether the utility's radial basis functions are divided by their sum. Decision: they are, so
+        that the utility extends to states far from every compared trajectory, where plain ones fall to zero.
+    """
+
+    features: str = "drawn"
+    centres: int = 300
+    bandwidth_factor: float = 1.0
+    utility_bandwidth_factor: float = 1.0
+    normalised_utility: bool = True
+
+    def __post_init__(self) -> None:
+        checks.one_of("features", self.features, ("drawn", "other"))
+        checks.whole("centres", self.centres)
+        checks.positive("bandwidth_factor", self.bandwidth_factor)
+        checks.positive("utility_bandwidth_factor", self.utility_bandwidth_factor)
+        if not isinstance(self.normalised_utility, bool):
+            raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")
+
+    def of_critic(self, period: ArrayLike | None) -> RadialBasisOptions:
+        """Those of Q and V; `period` of each observation dimension, None for none."""
+        return RadialBasisOptions(self.centres, self.bandwidth_factor, period)
+
+    def of_utility(self, period: ArrayLike | None) -> RadialBasisOptions:
+        """Those of the utility."""
+        return RadialBasisOptions(self.centres, self.utility_bandwidth_factor, period, self.normalised_utility)
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """How the policy begins, explores and is evaluated.
+
+    Attributes:
+      trajectories_per_iteration: N.
+      max_steps: steps an episode; None for the environment's own limit.
+      exploration_hold: steps for which the exploring policy's random choice is held, so that the trajectories of an
+        iteration differ; the paper's is 1. Evaluations never hold it.
+      evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
+      policy: the kind of policy. `auto` takes tabular for discrete states, softmax for discrete actions in continuous
+        states, gaussian-process otherwise; `other` is a policy of the user's.
+      initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
+    """
+
+    trajectories_per_iteration: int = 10
+    max_steps: int | None = None
+    exploration_hold: int = 1
+    evaluation_episodes: int = 100
+    policy: str = "auto"
+    initial_action_scale: float = 0.75
+
+    def __post_init__(self) -> None:
+        checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
+        if self.max_steps is not None:
+            checks.whole("max_steps", self.max_steps)
+        checks.whole("exploration_hold", self.exploration_hold)
+        checks.whole("evaluation_episodes", self.evaluation_episodes)
+        checks.one_of("policy", self.policy, POLICIES)
+        checks.positive("initial_action_scale", self.initial_action_scale)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Options of one run; names follow the paper and the command line.
+    """All options of one run.
 
     Attributes:
       env: a short name, a gymnasium id, or how an environment object describes itself.
-      utility: how step 1 estimates the utility; `known-reward` is the ceiling: the hidden reward itself.
-      iterations: cycles of the four steps.
-      kl_bound: ε of eq. 11, nats.
-      schedule: what the bound of each iteration follows: `constant`, kl_bound itself; `confidence`, the posterior's
-        certainty that the update is an improvement; `other`, a schedule of the user's.
-      likelihood: of an answer given the margin; `mixed` is eq. 8.
-      prior_scale: σ, the prior's standard deviation of each utility weight.
-      steepness: m of the likelihood, for differences divided by their largest absolute entry.
-      lapse_rate: λ, the probability that an answer is a coin toss, in [0, 1).
-      hyperparameters: whether the utility's length scales, the steepness and the lapse rate are chosen each iteration
-        by the `evidence` of the answers, beginning at the given ones, or are the `given` ones; `averaged` is over
-        length scales and steepness, each as likely as the evidence says.
-      utility_bandwidth_factor: multiplies the median rule for the utility's features.
-      normalised_utility: whether the utility's radial basis functions are divided by their sum. Decision: they are, so
-        that "upright is good" goes on to upright states that no compared trajectory was in, where the plain functions
-        of the paper fall to zero and hold the policy to what it knows.
       seed: of every random choice of the run.
-      query: which of the new trajectories are asked about; `highest-utility` is the paper's rule, the others look at
-        the posterior. `information-when-unsure` is the paper's rule while the schedule `confidence` finds a signal of
-        0.75 or more; with less it asks for the most information about any trajectory that was never compared.
-      trajectories_per_iteration: N.
-      queries_per_iteration, first_queries: M, in later iterations and in the first.
-      unasked_iterations: so many iterations in a row, at most, and no more than half the answers so far (ties among
-        them), ask nothing, once there is a preference: with the schedule `confidence` while the posterior has converged
-        and the signal is 0.5 or more; with one that has no signal, as `constant`, always. 0 is the paper's.
-      discount: γ.
-      trajectory_discount: γ of ψ(τ) in the preferences; None for `discount`, as in the paper; 1 for an expert who
-        judges whole trajectories, whose answers less would explain by how the trajectories begin.
-      policy: the kind of policy; `auto` takes tabular for discrete states, softmax for discrete actions in continuous
-        states, gaussian-process otherwise; `other` stands for a policy of the user's.
-      features: φ(s) as `drawn` by the settings, or `other`, a function of the user's.
-      environment: `named`, which `env` opens again, or `other`, an object of the user's that is not.
-      evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
-      max_steps: steps an episode; None for the environment's own limit.
-      centres: radial basis functions of each kind of feature.
-      bandwidth_factor: multiplies the median rule for the features of Q and V.
-      updates_per_iteration: updates of the policy from the same trajectories and utility, at most, until it has moved
-        by most of the bound, which holds for each of them; each has the Q of the policy that the one before it left,
-        and all but the first hold a continuous policy's spread. 1 is the paper's.
-      recent_iterations: the policy update takes the states of so many last iterations; None for those of all. LSTD
-        always has all transitions.
-      update_states: of these states the policy update takes so many at most, drawn at random, where they are
-        continuous: what it costs, in seconds and memory, is then bounded however long the episodes are.
-      exploration_hold: steps for which the exploring policy's random choice is held; 1 is the paper's. Noise drawn
-        afresh at each step averages out and leaves the trajectories of an iteration alike. Evaluations never hold it.
-      initial_action_scale: standard deviation of the first continuous policy, in ranges of the action space.
-      fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂.
-      expert, wrong_answers: who answers, and the share of a simulated expert's answers that are turned round; kept so
-        that a stopped run finds its expert again.
+      iterations: cycles of the four steps.
+      environment: `named`, which `env` opens again, or `other`, an object of the user's.
+      expert, wrong_answers: who answers, and the share of a simulated expert's answers that are reversed; a stopped run
+        finds its expert again by them.
+      model, estimation, features, critic, update, rollouts, questions: the options of each part.
     """
 
     env: str
-    utility: str = "posterior-mean"
-    iterations: int = 25
-    kl_bound: float = 0.3
-    schedule: str = "constant"
-    likelihood: str = "mixed"
-    prior_scale: float = 1.0
-    steepness: float = 5.0
-    lapse_rate: float = 0.0
-    hyperparameters: str = "evidence"
-    utility_bandwidth_factor: float = 1.0
-    normalised_utility: bool = True
     seed: int = 0
-    query: str = "highest-utility"
-    trajectories_per_iteration: int = 10
-    queries_per_iteration: int = 1
-    first_queries: int = 2
-    unasked_iterations: int = 0
-    discount: float = 0.98
-    trajectory_discount: float | None = None
-    policy: str = "auto"
-    features: str = "drawn"
+    iterations: int = 25
     environment: str = "named"
-    evaluation_episodes: int = 100
-    max_steps: int | None = None
-    centres: int = 300
-    bandwidth_factor: float = 1.0
-    updates_per_iteration: int = 1
-    recent_iterations: int | None = None
-    update_states: int = 20_000
-    exploration_hold: int = 1
-    initial_action_scale: float = 0.75
-    fixed_point_ridge: float = 1e-8
-    projection_ridge: float = 1e-8
     expert: str = "return"
     wrong_answers: float = 0.0
+    model: PreferenceModel = field(default_factory=PreferenceModel)
+    estimation: Estimation = field(default_factory=Estimation)
+    features: Features = field(default_factory=Features)
+    critic: Critic = field(default_factory=Critic)
+    update: PolicyUpdate = field(default_factory=PolicyUpdate)
+    rollouts: Rollouts = field(default_factory=Rollouts)
+    questions: Questions = field(default_factory=Questions)
 
     def __post_init__(self) -> None:
-        for name, choices in CHOICES.items():
-            _one_of(name, getattr(self, name), choices)
-        left_out = [name for name in MAY_BE_NONE if getattr(self, name) is None]
-        for name, (holds, expected) in NUMBERS.items():
-            if name not in left_out:
-                _number(name, getattr(self, name), holds, expected)
-        for name, least in LEAST.items():
-            if name not in left_out:
-                _whole(name, getattr(self, name), least)
-        if not isinstance(self.normalised_utility, bool):
-            raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")
+        checks.whole("seed", self.seed, 0)
+        checks.whole("iterations", self.iterations)
+        checks.one_of("environment", self.environment, ("named", "other"))
+        checks.one_of("expert", self.expert, ("return", "terminal", "other"))
+        checks.share("wrong_answers", self.wrong_answers)
         self._check_together()
 
     def _check_together(self) -> None:
-        """What one option asks of another."""
-        if self.utility in WITHOUT_POSTERIOR:
-            for name, usual in (("schedule", "constant"), ("query", QUERIES[0])):
-                value = getattr(self, name)
+        """What one part's option asks of another part's."""
+        utility, query, schedule = self.estimation.utility, self.questions.query, self.update.schedule
+        if utility in WITHOUT_POSTERIOR:
+            for name, value, usual in (("schedule", schedule, "constant"), ("query", query, "highest-utility")):
                 if value not in (usual, "other"):
-                    raise ValueError(f"{name}: expected {usual} with {self.utility}, no posterior, got {value!r}")
-        if self.query == "information-when-unsure" and self.schedule != "confidence":
-            raise ValueError(f"schedule: expected confidence with the query {self.query}, got {self.schedule!r}")
-        if self.hyperparameters == "averaged" and self.utility != "posterior-mean":
-            raise ValueError(f"utility: expected posterior-mean with averaged hyperparameters, got {self.utility!r}")
-        for name, limit in (
-            ("queries_per_iteration", self.trajectories_per_iteration),
-            ("first_queries", self.trajectories_per_iteration - 1),
-        ):
-            if getattr(self, name) > limit:
-                raise ValueError(f"{name}: expected at most {limit} with {limit} candidates, got {getattr(self, name)}")
+                    raise ValueError(f"{name}: expected {usual} with {utility}, no posterior, got {value!r}")
+        if query == "information-when-unsure" and schedule != "confidence":
+            raise ValueError(f"schedule: expected confidence with the query {query}, got {schedule!r}")
+        number = self.rollouts.trajectories_per_iteration
+        for name, limit in (("queries_per_iteration", number), ("first_queries", number - 1)):
+            if (value := getattr(self.questions, name)) > limit:
+                raise ValueError(f"{name}: expected at most {limit} with {number} trajectories, got {value}")
+
+    @classmethod
+    def from_options(cls, env: str, options: Mapping[str, Any]) -> "Settings":
+        """The settings with these options, named alone; the defaults for all others.
+
+        Raises:
+          ValueError: an unknown option, or a value that its part does not take.
+        """
+        unknown = sorted(set(options) - set(OPTIONS))
+        if unknown:
+            raise ValueError(f"settings: expected options among {', '.join(sorted(OPTIONS))}, got {', '.join(unknown)}")
+        parts: dict[str, dict[str, Any]] = {name: {} for name in ("", *PARTS)}
+        for name, value in options.items():
+            parts[OPTIONS[name]][name] = value
+        own = parts.pop("")
+        return cls(env, **own, **{name: PARTS[name](**chosen) for name, chosen in parts.items()})
+
+    def options(self) -> dict[str, Any]:
+        """All options, named alone, with their values."""
+        return {name: getattr(getattr(self, part) if part else self, name) for name, part in OPTIONS.items()}
 
     @property
     def own_parts(self) -> tuple[str, ...]:
-        """What of the run was an object of the user's, which has to be passed again to go on, or its expert."""
-        return tuple(name for name in CHOICES if getattr(self, name) == "other")
+        """The parts that are objects of the user's and have to be passed again to go on, or the expert."""
+        return tuple(name for name, value in self.options().items() if value == "other")
 
     @property
-    def psi_discount(self) -> float:
+    def trajectory_discount(self) -> float:
         """γ of ψ(τ), by which answers are explained."""
-        return self.discount if self.trajectory_discount is None else self.trajectory_discount
+        given = self.estimation.trajectory_discount
+        return self.critic.discount if given is None else given
 
 
-def _one_of(name: str, value: object, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
-
-
-def _number(name: str, value: Any, holds: Any, expected: str) -> None:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    if not (number and holds(value)):
-        raise ValueError(f"{name}: expected {expected}, got {value!r}")
-
-
-def _whole(name: str, value: Any, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name}: expected a whole number >= {least}, got {value!r}")
-
-
-# One row a domain: what differs from the defaults above, with the evidence for each number. Ten trajectories an
-# iteration and the paper's number of answers are the protocol and not for tuning.
-PRESETS: dict[str, dict[str, Any]] = {
-    # discount: the expert judges 300 undiscounted steps, and the paper's 0.98 lets ψ and Q see only the first fifty or
-    # so. Seeds 0-19, posterior mean: with 0.98 the lower quartile is at 0.50 of the optimum at answer 11, with 0.99 it
-    # reaches 0.99 at answer 10 and with 0.995 at answer 8; the median does by answer 6 or 7 with each. Steepness 1 or
-    # 5, a lapse rate of 0.1, the logistic likelihood, and bounds of 0.15, 0.2 and 0.5 in place of 0.3 made no such
-    # difference.
-    # hyperparameters: one-hot features have no length scale, and choosing steepness and lapse rate by evidence puts off
-    # the lower quartile's 0.99 on the same seeds from answer 8 to 13.
-    # exploration_hold: seeds 0-19, the lower quartile's 0.99 comes at answer 6 or before, without it at 8; on seeds
-    # 1000-1019 without it at answer 10 with one version's draws and at 15 with another's.
-    "gridworld": {"iterations": 25, "discount": 0.995, "hyperparameters": "given", "exploration_hold": 3},
-    # kl_bound, ridges: the paper's authors'. Half the median rule: with the known reward, seeds 0 and 1, a quarter and
-    # a half end alike (-950 to -1000), and the whole rule had reached -1900 by iteration 9. 300 centres, not 700: the
-    # same end for a quarter of the time. The last four iterations' states: those of all hold the bound back late in a
-    # run. Posterior mean, last value: kl_bound 0.35, seeds 0-3: -963, -963, -996, -996; 0.5, seeds 0-2: -938, -967,
-    # -967, but seed 1 only from answer 23 on (0.35: from 13). trajectory_discount: kl_bound 0.5, seeds 100-119, after
-    # 11 answers -992 [-1025] with 1, -1012 [-1857] with that of Q, after 16 -968 [-1011] and -978 [-1184]; below -1300
-    # then 3 and 5. exploration_hold, a quarter of a second: posterior mean, below -1300 after 21 answers: 3 of 20
-    # without (seeds 100-119), 2 of 20 with it (seeds 120-139), median -970 and -955; with the query rule `information`
-    # 1 and, seeds 120-139, 26 answers, 1.
-    "swing-up": {
-        "iterations": 40,
-        "kl_bound": 0.35,
-        "trajectory_discount": 1.0,
-        "centres": 300,
-        "bandwidth_factor": 0.5,
-        "recent_iterations": 4,
-        "exploration_hold": 5,
-        "initial_action_scale": 0.9,
-        "fixed_point_ridge": 1e-5,
-        "projection_ridge": 1e-5,
-    },
-    # utility_bandwidth_factor: posterior mean, seeds 100-107, 400 evaluation episodes, mean of the last values: three
-    # times the median rule -10.5, six times -9.0, twelve times -8.3, better than three on seven and on eight seeds of
-    # eight. So wide, the utility is nearly a quadratic function. update_states: six times and 4000 states -8.6, so that
-    # leaving the others out loses nothing. trajectory_discount 1: no difference on the same eight seeds (paired, at the
-    # end 0.0 [-1.0, +1.0]).
-    # The others, seeds 106-109, mean of three last values in increasing order, 16 to 25 iterations: twice the median
-    # rule for all features, first scale 0.75 and the last four iterations' states: -19 on seed 106, where the known
-    # reward ends at -11; first scale 1.5 and all states: -17, -13, -11, -10; and three times the rule for the utility:
-    # -13, -11, -11, -10; first scale 3 instead: -16, -12, -11, -10. Known reward, seeds 106 and 107: ridges of 1e-8 -12
-    # and -16, of 1e-5 -8 and -10, of 1e-3 -16 and -11; discount 0.95 below -16, 0.99 -18 and -10; kl_bound 0.6 and 0.99
-    # -13 on seed 106; a linear-Gaussian policy -35. hyperparameters: seeds 100 and 101, by evidence -26, -60, given
-    # -12, -25 with an older preset: four length scales are more than these answers can tell.
-    "bicycle": {
-        "iterations": 25,
-        "kl_bound": 0.3,
-        "hyperparameters": "given",
-        "utility_bandwidth_factor": 12.0,
-        "centres": 300,
-        "bandwidth_factor": 2.0,
-        "update_states": 4000,
-        "exploration_hold": 3,
-        "initial_action_scale": 1.5,
-        "fixed_point_ridge": 1e-5,
-        "projection_ridge": 1e-5,
-    },
-    # Ridges, bandwidths, bound and first scale are the paper's authors'. discount: the goal comes after 100 to 500
-    # steps, where 0.98 leaves nothing of it, neither in ψ nor in Q. Posterior mean, seeds 100-107, 10 iterations: with
-    # 0.995 all end between -91 and -118; with 0.98 seeds 100-103 reach -150 up to three iterations later, and three of
-    # the seeds 1000-1009 never left -500, which is what the search for it began with.
-    "acrobot": {
-        "iterations": 15,
-        "discount": 0.995,
-        "kl_bound": 0.3,
-        "centres": 300,
-        "bandwidth_factor": 2.0,
-        "exploration_hold": 3,
-        "initial_action_scale": 3.0,
-        "fixed_point_ridge": 1e-8,
-        "projection_ridge": 1e-6,
-    },
-    # discount: three seeds only, 0-2, 15 iterations, posterior mean with the hyper-parameters given; last values
-    # (of at most 500): 0.98: 75, 88, 371; 0.99: 161, 261, 457; 0.995: 316, 385, 470. By evidence, seeds 100 and 101,
-    # 0.995: 356 and 447 (mean of the last three 452, 439); with kl_bound 0.3 and four iterations' states 389, 481.
-    # The curves are not monotone.
-    "CartPole-v1": {"iterations": 15, "kl_bound": 0.1, "discount": 0.995},
+PARTS: dict[str, Any] = {
+    "model": PreferenceModel,
+    "estimation": Estimation,
+    "features": Features,
+    "critic": Critic,
+    "update": PolicyUpdate,
+    "rollouts": Rollouts,
+    "questions": Questions,
 }
-# The same task as the swing-up, with starts anywhere; its ridges were not tried. Seed 100: -412 after 11 answers, -695
-# after 16; discount 0.995: -480 and -583.
-PRESETS["Pendulum-v1"] = PRESETS["swing-up"] | {
-    "iterations": 15,
-    "trajectory_discount": None,
-    "fixed_point_ridge": 1e-8,
-    "projection_ridge": 1e-8,
-}
-
-
-# An environment that the user made is known by its gymnasium id.
-PRESETS |= {
-    "bayespbrl/Gridworld-v0": PRESETS["gridworld"],
-    "bayespbrl/Bicycle-v0": PRESETS["bicycle"],
-    "bayespbrl/SwingUp-v0": PRESETS["swing-up"],
-    "bayespbrl/Acrobot-v0": PRESETS["acrobot"],
+# The part that reads each option; "" for the run's own. Answers of "no difference" have no place in a run yet.
+OPTIONS: dict[str, str] = {f.name: "" for f in fields(Settings) if f.name not in ("env", *PARTS)} | {
+    option.name: part for part, kind in PARTS.items() for option in fields(kind) if option.name != "tie_threshold"
 }
 
 
@@ -295,11 +191,7 @@ def settings_for(env: str, **changes: Any) -> Settings:
     """The preset of a domain (the defaults, for an environment without one) with `changes`; None changes nothing.
 
     Raises:
-      ValueError: an option there is not, or a value that `Settings` does not take.
+      ValueError: as `Settings.from_options`.
     """
-    known = {field.name for field in fields(Settings)}
-    unknown = sorted(set(changes) - known)
-    if unknown:
-        raise ValueError(f"settings: expected options among {', '.join(sorted(known))}, got {', '.join(unknown)}")
     chosen = {name: value for name, value in changes.items() if value is not None}
-    return replace(Settings(env), **(PRESETS.get(env, {}) | chosen))
+    return Settings.from_options(env, PRESETS.get(env, {}) | chosen)

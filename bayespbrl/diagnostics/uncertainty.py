@@ -21,7 +21,7 @@ from bayespbrl.improvement.q_function import QFunction, estimate_q
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Trajectory, transitions
 from bayespbrl.utility.averaging import AveragedUtility
-from bayespbrl.utility.estimate import spacing
+from bayespbrl.utility.posterior_utility import spacing
 
 # Quantiles of the intervals in the figures: half and nine tenths of the draws.
 INTERVALS = ((0.25, 0.75, 4.0), (0.05, 0.95, 1.2))
@@ -105,7 +105,6 @@ def successor_features(learner: Learner, *, seed: int = 0) -> QFunction:
     Source: Dayan (1993), "Improving generalization for temporal difference learning: the successor representation".
     """
     features = _with_posterior(learner.estimate).features
-    settings = learner.settings
     steps = transitions(learner.trajectories)
     return estimate_q(
         learner.policy,
@@ -114,9 +113,7 @@ def successor_features(learner: Learner, *, seed: int = 0) -> QFunction:
         key=jax.random.key(seed),
         action_space=learner.environment.action_space,
         features=learner.state_action_features(steps, rng=np.random.default_rng(seed)),
-        discount=settings.discount,
-        fixed_point_ridge=settings.fixed_point_ridge,
-        projection_ridge=settings.projection_ridge,
+        critic=learner.settings.critic,
     )
 
 

@@ -1,6 +1,5 @@
 """Step 2, its critic: from the utilities of transitions to Q, by LSTD (paper, "Step 2")."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
@@ -10,11 +9,32 @@ import jax
 import numpy as np
 from gymnasium import Space
 
+from bayespbrl import checks
+from bayespbrl.features import StateActionFeatures
 from bayespbrl.improvement.lstd import TransitionSums, solve_lstd, transition_sums
 from bayespbrl.policies import clipped, is_discrete, sample_actions
 from bayespbrl.trajectories import Transitions
 
 ROWS_AT_A_TIME = 16_384
+
+
+@dataclass(frozen=True)
+class Critic:
+    """How Q is estimated.
+
+    Attributes:
+      discount: γ in [0, 1).
+      fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂ ≥ 0.
+    """
+
+    discount: float = 0.98
+    fixed_point_ridge: float = 1e-8
+    projection_ridge: float = 1e-8
+
+    def __post_init__(self) -> None:
+        checks.share("discount", self.discount, below_one=True)
+        checks.non_negative("fixed_point_ridge", self.fixed_point_ridge)
+        checks.non_negative("projection_ridge", self.projection_ridge)
 
 
 @dataclass(frozen=True)
@@ -26,12 +46,12 @@ class QFunction:
       weights: θ, shape (Q + 1,), or (Q + 1, n) for n utilities side by side; the last row is the bias.
     """
 
-    features: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    features: StateActionFeatures
     weights: np.ndarray
 
     def __call__(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Q of N pairs, shape (N,), or (N, n)."""
-        return self.features(states, actions) @ self.weights[:-1] + self.weights[-1]
+        return np.asarray(self.features(states, actions) @ self.weights[:-1] + self.weights[-1])
 
 
 def estimate_q(
@@ -40,11 +60,9 @@ def estimate_q(
     utilities: np.ndarray,
     *,
     key: jax.Array,
-    action_space: Space,
-    features: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    discount: float,
-    fixed_point_ridge: float,
-    projection_ridge: float,
+    action_space: Space[Any],
+    features: StateActionFeatures,
+    critic: Critic,
 ) -> QFunction:
     """LSTD-Q with a bias column, from every observed transition.
 
@@ -55,7 +73,7 @@ def estimate_q(
       key: for the fresh action in each next state, where actions cannot be enumerated.
       action_space: bounds the fresh actions.
       features: φ(s, a).
-      discount, fixed_point_ridge, projection_ridge: of LSTD.
+      critic: LSTD's options.
     """
     steps, utilities, counts = _counted(steps, utilities)
     following = None if is_discrete(policy) else clipped(sample_actions(policy, key, steps.next_states), action_space)
@@ -73,12 +91,7 @@ def estimate_q(
 
     # a block at a time: the features of all transitions would fill the memory of a long run
     blocks = [slice(start, start + ROWS_AT_A_TIME) for start in range(0, len(steps), ROWS_AT_A_TIME)]
-    weights = solve_lstd(
-        reduce(add, map(sums, blocks)),
-        discount=discount,
-        fixed_point_ridge=fixed_point_ridge,
-        projection_ridge=projection_ridge,
-    )
+    weights = solve_lstd(reduce(add, map(sums, blocks)), **vars(critic))
     return QFunction(features, weights)
 
 
@@ -97,12 +110,10 @@ def _counted(steps: Transitions, utilities: np.ndarray) -> tuple[Transitions, np
     return unique, means, counts.astype(float)
 
 
-def _expected_features(
-    policy: Any, states: np.ndarray, features: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> np.ndarray:
+def _expected_features(policy: Any, states: np.ndarray, features: StateActionFeatures) -> np.ndarray:
     """Σₐ π(a|s)φ(s, a). Decision: where actions can be enumerated, their expectation replaces one fresh sample."""
     probabilities = policy.probabilities(states)
-    total = probabilities[:, :1] * features(states, np.zeros(len(states), dtype=np.int64))
+    total: np.ndarray = probabilities[:, :1] * features(states, np.zeros(len(states), dtype=np.int64))
     for action in range(1, probabilities.shape[1]):
         total += probabilities[:, action, None] * features(states, np.full(len(states), action))
     return total

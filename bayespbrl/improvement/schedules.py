@@ -1,7 +1,7 @@
-"""The KL bound of each policy update: constant, or as large as the posterior is sure of it (paper, future work).
+"""The KL bound of each update: constant, or by the posterior's confidence in the update (paper, future work).
 
-A schedule is called once an iteration, after the utility and Q are estimated and before the policy moves, with the
-`Situation`; it returns the bound in nats, or a `Bound`, which says why. Three lines make one of your own:
+A schedule decides once an iteration, after the utility and Q are estimated and before the policy moves. It is called
+with the `Situation` and returns the bound in nats, or a `Bound` with its reason. Three lines make one of your own:
 
     def cautious(situation):
         return 0.5 if situation.update.agreement(0.5) > 0.9 else 0.1
@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from bayespbrl import checks
 from bayespbrl.improvement.update import ProposedUpdate
+from bayespbrl.utility.estimate import UtilityEstimate
 
-LEAST_BOUND = 0.02  # nats; an update of nothing would leave the draws nothing to disagree about
+LEAST_BOUND = 0.02  # nats; without any step the draws would have nothing to disagree about
 
 
 @dataclass(frozen=True)
@@ -28,13 +30,13 @@ class Situation:
       answers: counted so far.
       usual_bound: the bound that the run was given, nats.
       estimate: the utility estimate of this iteration; `estimate.quality` says whether it can be trusted.
-      update: what an update of any size would do, in the eyes of each posterior draw.
+      update: the proposed update, as each posterior draw judges it.
     """
 
     iteration: int
     answers: int
     usual_bound: float
-    estimate: Any
+    estimate: UtilityEstimate
     update: ProposedUpdate
 
 
@@ -45,13 +47,27 @@ class Bound:
     Attributes:
       kl_bound: ε of eq. 11, nats.
       reason: in words.
-      statistics: what it rests on, by name: plain numbers. One named `signal`, in [0, 1], also says whether an
-        iteration may ask nothing (`Settings.unasked_iterations`).
+      signal: confidence that the update is a gain, in [0, 1]; query rules and iterations without a question depend on
+        it. None for a schedule that has no such figure.
+      statistics: further figures by name: plain numbers.
     """
 
     kl_bound: float
     reason: str = ""
-    statistics: dict[str, float] = field(default_factory=dict)
+    signal: float | None = None
+    statistics: Mapping[str, float] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """Reason, signal and statistics as plain data; `recalled` reads them."""
+        signal = {} if self.signal is None else {"signal": self.signal}
+        return {"reason": self.reason, **signal, **self.statistics}
+
+    @classmethod
+    def recalled(cls, kl_bound: float, summary: Mapping[str, Any]) -> "Bound":
+        """The bound that `summary` describes."""
+        signal = summary.get("signal")
+        figures = {name: value for name, value in summary.items() if name not in ("reason", "signal")}
+        return cls(kl_bound, summary.get("reason", ""), signal, figures)
 
 
 Schedule = Callable[[Situation], "Bound | float"]
@@ -59,7 +75,7 @@ Schedule = Callable[[Situation], "Bound | float"]
 
 @dataclass(frozen=True)
 class ConstantBound:
-    """The same bound at every iteration: the run's, unless told; the paper's schedule."""
+    """The same bound at every iteration, the paper's schedule: the run's own where `kl_bound` is None."""
 
     kl_bound: float | None = None
 
@@ -69,15 +85,14 @@ class ConstantBound:
 
 @dataclass(frozen=True)
 class ConfidenceBound:
-    """As large a share of the largest bound as the posterior is sure of the gain that the update promises.
+    """A share of the largest bound that grows with the posterior's confidence in the gain of the update.
 
-    Each draw of the utility has a Q-function of its own (LSTD is linear in the utility), and the direction in which
-    REPS moves for the mean Q promises it a gain of G = Σ WᵢAᵢQᵢ (`ProposedUpdate.gains`). An update of relative length
-    s gains s·G and a draw regrets what it loses, so that of all s in [0, 1] the one that maximises
-    E[sG] − ½E[(sG)²]/E[G] is the *signal* s = E[G]²/(E[G]² + Var[G]). KL grows with the square of the length: the bound
-    is s² times the largest. It asks whether this update is safe, not whether the trajectories are easy to order, and
-    the answer does not depend on the units of the utility nor on any bound. Where the mean expects no gain the bound
-    is the least there is, and for a posterior that has not converged it is never raised over the run's own.
+    Each draw of the utility has a Q-function of its own (LSTD is linear in the utility). The direction in which REPS
+    moves for the mean Q promises it the gain G = Σ WᵢAᵢQᵢ (`ProposedUpdate.gains`). An update of relative length s
+    gains sG. The length in [0, 1] that maximises E[sG] − ½E[(sG)²]/E[G] is the *signal* s = E[G]²/(E[G]² + Var[G]). KL
+    grows with the square of the length, so the bound is s² times the largest. The signal depends neither on the unit of
+    the utility nor on any bound. Where the mean expects no gain the bound is the least; a posterior that has not
+    converged never raises it above the run's own.
 
     Attributes:
       largest: the bound when all draws expect the same gain, nats, > 0.
@@ -86,8 +101,7 @@ class ConfidenceBound:
     largest: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.largest) and self.largest > 0):
-            raise ValueError(f"largest: expected a finite number > 0, got {self.largest}")
+        checks.positive("largest", self.largest)
 
     def __call__(self, situation: Situation) -> Bound:
         quality, update, usual = situation.estimate.quality, situation.update, situation.usual_bound
@@ -96,48 +110,49 @@ class ConfidenceBound:
             "effective_sample_size_min": float(quality.effective_sample_size_min),
         }
         if update.q_draws is None:
-            return Bound(usual, "no posterior: the run's own bound", statistics)
+            return Bound(usual, "no posterior: the run's own bound", statistics=statistics)
         gains = update.gains()
         square = float(np.mean(gains)) ** 2
         total = square + float(np.var(gains))
         signal = square / total if total > 0 and np.mean(gains) > 0 else 0.0
-        statistics |= {"signal": signal, "agreement": float(np.mean(gains > 0))}
+        statistics["agreement"] = float(np.mean(gains > 0))
         bound = max(LEAST_BOUND, signal**2 * self.largest)
-        reason = f"{statistics['agreement']:.0%} of the draws expect a gain, whose signal is {signal:.2f}"
+        reason = f"{statistics['agreement']:.0%} of the draws expect a gain; signal {signal:.2f}"
         if not quality.converged and bound > usual:
-            return Bound(usual, f"{reason}; not converged: no more than the run's own bound", statistics)
-        return Bound(bound, reason, statistics)
+            return Bound(usual, f"{reason}; not converged: at most the run's own bound", signal, statistics)
+        return Bound(bound, reason, signal, statistics)
 
 
 SCHEDULES: dict[str, Schedule] = {"constant": ConstantBound(), "confidence": ConfidenceBound()}
 
 
-def decided(schedule: Schedule, situation: Situation) -> Bound:
-    """What `schedule` decides, checked.
+def decide(schedule: Schedule, situation: Situation) -> Bound:
+    """The checked decision of `schedule`.
 
     Raises:
-      ValueError: anything but a positive finite number, or a reason or statistics that a run cannot keep, naming the
-        schedule.
+      ValueError: a bound that is no positive finite number; a reason, signal or statistics that a run cannot keep. The
+        message names the schedule.
     """
     bound = schedule(situation)
-    name = getattr(schedule, "__name__", type(schedule).__name__)
+    name = f"schedule {getattr(schedule, '__name__', type(schedule).__name__)}"
     if not isinstance(bound, Bound):
-        bound = Bound(bound, "by a schedule of the user's own")
+        bound = Bound(bound, "by the user's own schedule")
     value = bound.kl_bound
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"schedule {name}: expected a positive finite KL bound, got {value!r}")
+        raise ValueError(f"{name}: expected a positive finite KL bound, got {value!r}")
     if not isinstance(bound.reason, str) or not isinstance(bound.statistics, Mapping):
         got = f"{bound.reason!r} and {bound.statistics!r}"
-        raise ValueError(f"schedule {name}: expected a reason in words and statistics by name, got {got}")
+        raise ValueError(f"{name}: expected a reason in words and statistics by name, got {got}")
     for key, figure in bound.statistics.items():
-        if not isinstance(key, str) or key == "reason" or not _kept(figure):
-            raise ValueError(f"schedule {name}: expected statistics that are numbers by name, got {key!r}: {figure!r}")
-    return Bound(float(value), bound.reason, dict(bound.statistics))
+        if not isinstance(key, str) or key in ("reason", "signal") or not _can_be_kept(figure):
+            raise ValueError(f"{name}: expected statistics that are numbers by name, got {key!r}: {figure!r}")
+    signal = None if bound.signal is None else checks.share(f"{name}, signal", bound.signal)
+    return Bound(float(value), bound.reason, signal, dict(bound.statistics))
 
 
-def _kept(figure: Any) -> bool:
-    """Whether a run can keep it: a number, a text, none, or a list of them."""
+def _can_be_kept(figure: Any) -> bool:
+    """Whether JSON can hold it: a number, a text, None, or a list of them."""
     if isinstance(figure, list | tuple):
-        return all(map(_kept, figure))
+        return all(map(_can_be_kept, figure))
     return figure is None or isinstance(figure, int | float | str | np.number | np.bool_)

@@ -11,7 +11,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, fields
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +20,7 @@ from bayespbrl.events import Entry, LearnerState, surviving
 from bayespbrl.features import StateFeatures
 from bayespbrl.runs.files import write_file
 from bayespbrl.runs.iteration_files import read_iteration, write_iteration
-from bayespbrl.settings import Settings
+from bayespbrl.settings import OPTIONS, Settings
 
 FORMAT = 2  # format 1 named classes by their modules
 HEAVY = ("collected", "improved")  # events with heavy parts, in the file of their iteration
@@ -46,7 +45,7 @@ class RunDirectory:
         path = Path(path)
         if path.exists() or path.is_symlink():
             raise ValueError(f"{path}: expected a run directory that does not exist yet, got an existing one")
-        content = {"format": FORMAT, "version": version("bayespbrl"), **asdict(settings)}
+        content = {"format": FORMAT, "version": version("bayespbrl"), "env": settings.env, **settings.options()}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             building = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
@@ -82,9 +81,11 @@ class RunDirectory:
                 f"{file}: expected format {FORMAT}, got {content['format']}: read it with the version that wrote it, "
                 f"{content.get('version', 'an older one')}"
             )
-        names = {field.name for field in fields(Settings)}
+        if not isinstance(content.get("env"), str):
+            raise ValueError(f"{file}: expected the environment's name as env, got {content.get('env')!r}")
+        known = {name: value for name, value in content.items() if name in OPTIONS}
         try:
-            return cls(path, Settings(**{name: value for name, value in content.items() if name in names}))
+            return cls(path, Settings.from_options(content["env"], known))
         except (TypeError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
 
@@ -193,7 +194,7 @@ class RunDirectory:
         """Write `summary.json`."""
         summary = {
             "env": self.settings.env,
-            "utility": self.settings.utility,
+            "utility": self.settings.estimation.utility,
             "seed": self.settings.seed,
             "finished": state.iteration >= self.settings.iterations,
             "answers": state.preferences.answers,

@@ -1,7 +1,6 @@
-"""A policy at work: one fresh episode as an animated GIF and as a film strip."""
+"""Films of a policy: one fresh episode as an animated GIF and as a film strip."""
 
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import jax
@@ -13,16 +12,19 @@ from bayespbrl.envs.opening import environment_attribute, environment_name, flat
 from bayespbrl.learner import Learner
 from bayespbrl.policies.actor import Actor
 
-FRAMES = 60  # of the GIF, at most twice as many
+FRAMES = 60  # pictures in the GIF of a drawn episode; where the environment renders itself, at most twice as many
 
 
 def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tuple[Path, Path]:
-    """Write `final.gif` and `final.png`, the film and the film strip of one episode under the learner's policy.
+    """Write the film and the film strip of one episode under the learner's policy: `final.gif` and `final.png`.
 
-    An environment whose dynamics can `draw` is drawn; any other one renders itself, in its mode `rgb_array`.
+    An environment whose dynamics have a method `draw` is drawn. Any other one renders itself in its mode `rgb_array`.
+
+    Returns:
+      the paths of the film and of the strip.
 
     Raises:
-      ValueError: an environment that cannot be rendered, or fails at it.
+      ValueError: an environment that cannot be rendered, or that fails while it is.
     """
     film, strip = directory / f"{name}.gif", directory / f"{name}.png"
     environment, settings = learner.environment, learner.settings
@@ -32,8 +34,8 @@ def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tu
                 environment,
                 learner.policy,
                 key=jax.random.key(settings.seed),
-                episodes=settings.trajectories_per_iteration,  # another number would be compiled anew
-                max_steps=settings.max_steps,
+                episodes=settings.rollouts.trajectories_per_iteration,  # another number would need a new compilation
+                max_steps=settings.rollouts.max_steps,
             )[0]
             pictures.film(environment, shown, film, max_frames=FRAMES)
             pictures.drawing(environment, shown, strip)
@@ -48,9 +50,9 @@ def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tu
 
 
 def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
-    """Pictures of one episode by the environment itself, and for how many milliseconds to show each."""
+    """Pictures of one episode that the environment renders, and the milliseconds for which to show each."""
     env, settings = _rendering(learner.environment), learner.settings
-    limit = rollouts.step_limit(learner.environment, settings.max_steps)
+    limit = rollouts.step_limit(learner.environment, settings.rollouts.max_steps)
     actor = Actor(learner.policy, env.action_space, np.random.default_rng(settings.seed))
     stride = 1
     try:
@@ -63,7 +65,7 @@ def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
                 frames.append(_frame(env))
             if ended:
                 break
-            if len(frames) == 2 * FRAMES:  # an episode of any length in bounded memory
+            if len(frames) == 2 * FRAMES:  # bounds the memory of a long episode
                 frames, stride = frames[::2], 2 * stride
     finally:
         if env is not learner.environment:
@@ -72,7 +74,7 @@ def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
 
 
 def _rendering(environment: gymnasium.Env) -> gymnasium.Env:
-    """The environment in a mode that renders: made again where its id was given, else the user's own object."""
+    """The environment in a mode that renders: made again where its id was given, else the user's object."""
     spec = made_from(environment)
     if spec is None:
         if environment.render_mode != "rgb_array":
@@ -85,7 +87,7 @@ def _rendering(environment: gymnasium.Env) -> gymnasium.Env:
 
 
 def _frame(env: gymnasium.Env) -> np.ndarray:
-    frame: Any = np.asarray(env.render())
+    frame = np.asarray(env.render())
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise ValueError(f"expected a picture of shape (height, width, 3) in uint8, got {frame.shape} in {frame.dtype}")
     return frame

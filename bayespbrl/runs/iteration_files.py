@@ -1,4 +1,4 @@
-"""The heavy parts of one iteration as one netCDF file: trajectories, policy, utility estimate and its posterior."""
+"""The netCDF file of one iteration: its trajectories, the policy, the utility estimate and its posterior."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,12 +8,12 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl.events import Entry
+from bayespbrl.features import StateFeatures
 from bayespbrl.models import restored, stored
-from bayespbrl.runs import stored_classes as records
 from bayespbrl.runs.files import written_aside
+from bayespbrl.runs.stored_classes import from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility.averaging import AveragedUtility
-from bayespbrl.utility.estimate import LinearUtility
+from bayespbrl.utility import AveragedUtility, FitQuality, LinearProgramUtility, PosteriorUtility, UtilityEstimate
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Any = "h5netcdf"
@@ -21,26 +21,40 @@ PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "policy", 
 
 
 def write_iteration(file: Path, entry: Entry) -> None:
-    """The heavy parts of one iteration as one netCDF file, whole or not at all."""
+    """Write the heavy parts of one iteration to a netCDF file, whole or not at all."""
     parts = entry.parts
     groups = {"trajectories": xr.DataTree(_trajectories_dataset(parts["trajectories"]))}
     if "policy" in parts:
-        groups["policy"] = records.to_tree(parts["policy"])
+        groups["policy"] = to_tree(parts["policy"])
         groups |= _estimate_groups(parts["estimate"])
     with written_aside(file) as aside:
         xr.DataTree.from_dict(groups).to_netcdf(aside, engine=ENGINE)
 
 
-def read_iteration(file: Path, event: str, *, features: Any = None, known: Sequence[type] = ()) -> dict[str, Any]:
-    """The parts that `event`, `collected` or `improved`, brought; `ValueError` for a truncated or foreign file."""
+def read_iteration(
+    file: Path, event: str, *, features: StateFeatures | None = None, known: Sequence[type] = ()
+) -> dict[str, Any]:
+    """The heavy parts of an event, `collected` or `improved`. Arguments and errors as of `read_parts`."""
     return read_parts(file, PARTS[event], features=features, known=known)
 
 
-def read_parts(file: Path, names: Sequence[str], *, features: Any = None, known: Sequence[type] = ()) -> dict[str, Any]:
-    """Some of the `trajectories`, `policy` and `estimate` of an iteration; errors as of `read_iteration`."""
+def read_parts(
+    file: Path, names: Sequence[str], *, features: StateFeatures | None = None, known: Sequence[type] = ()
+) -> dict[str, Any]:
+    """Some of the parts of an iteration by name: `trajectories`, `policy`, `estimate`.
+
+    Args:
+      file: as written by `write_iteration`.
+      names: of the parts to read.
+      features: φ(s) of the user's, where the run was started with it.
+      known: classes of the user's that the file may name.
+
+    Raises:
+      ValueError: a file that is missing, truncated or foreign.
+    """
     read = {
         "trajectories": lambda tree: _read_trajectories(tree.children["trajectories"].to_dataset()),
-        "policy": lambda tree: records.from_tree(tree.children["policy"], known=known),
+        "policy": lambda tree: from_tree(tree.children["policy"], known=known),
         "estimate": lambda tree: _read_estimate(tree, features, known),
     }
     try:
@@ -54,7 +68,7 @@ def read_parts(file: Path, names: Sequence[str], *, features: Any = None, known:
 
 
 def _trajectories_dataset(trajectories: Sequence[Trajectory]) -> xr.Dataset:
-    """Trajectories side by side, filled up with zeros to the longest."""
+    """Trajectories as one table, each filled up with zeros to the length of the longest."""
     lengths = np.array([len(trajectory) for trajectory in trajectories])
 
     def filled(arrays: list[np.ndarray], extra: int) -> np.ndarray:
@@ -86,28 +100,6 @@ def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
     )
 
 
-def _estimate_groups(estimate: Any) -> dict[str, xr.DataTree]:
-    """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
-    if not isinstance(estimate, LinearUtility):
-        return {"utility": records.to_tree(estimate)}
-    data = xr.Dataset(
-        {"weights": ("feature", estimate.weights)}, attrs={"discount": estimate.discount, "scale": estimate.scale}
-    )
-    children = {"quality": records.to_tree(estimate.quality)}
-    try:
-        children["features"] = records.to_tree(estimate.features)
-    except ValueError:
-        data.attrs["features"] = "other"  # the user's function, which has to be passed again
-    groups = {"utility": xr.DataTree(data, children=children)}
-    if isinstance(estimate, AveragedUtility):
-        groups["average"] = _average_group(estimate)
-    if estimate.posterior is not None:
-        small = stored(estimate.posterior)
-        groups |= {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
-        groups["fit"] = xr.DataTree(small.to_dataset())
-    return groups
-
-
 AVERAGE = {
     "multiples": ("component", "dimension"),
     "probabilities": ("component",),
@@ -117,38 +109,65 @@ AVERAGE = {
 }
 
 
-def _average_group(estimate: AveragedUtility) -> xr.DataTree:
-    data = xr.Dataset({name: (dimensions, getattr(estimate, name)) for name, dimensions in AVERAGE.items()})
+def _estimate_groups(estimate: UtilityEstimate) -> dict[str, xr.DataTree]:
+    """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
+    match estimate:
+        case LinearProgramUtility():
+            return {"utility": _weights_group(estimate, estimate.quality)}
+        case PosteriorUtility():
+            return {"utility": _weights_group(estimate, estimate.quality), **_posterior_groups(estimate.posterior)}
+        case AveragedUtility():
+            data = xr.Dataset({name: (dimensions, getattr(estimate, name)) for name, dimensions in AVERAGE.items()})
+            return {
+                "utility": _weights_group(estimate.sampled, estimate.quality),
+                "average": xr.DataTree(data, children=_function_group("base", estimate.base)),
+                **_posterior_groups(estimate.sampled.posterior),
+            }
+        case _:
+            return {"utility": to_tree(estimate)}
+
+
+def _weights_group(estimate: PosteriorUtility | LinearProgramUtility, quality: FitQuality) -> xr.DataTree:
+    attributes: dict[str, Any] = {"discount": estimate.discount, "scale": estimate.scale}
+    functions = _function_group("features", estimate.features)
+    if not functions:
+        attributes["features"] = "other"  # the user's function, which has to be passed again
+    data = xr.Dataset({"weights": ("feature", estimate.weights)}, attrs=attributes)
+    return xr.DataTree(data, children={"quality": to_tree(quality), **functions})
+
+
+def _function_group(name: str, features: StateFeatures) -> dict[str, xr.DataTree]:
+    """φ as a group; none for a function of the user's."""
     try:
-        return xr.DataTree(data, children={"base": records.to_tree(estimate.base)})
+        return {name: to_tree(features)}
     except ValueError:
-        return xr.DataTree(data)  # the user's function: the estimate's own
+        return {}
 
 
-def _read_estimate(tree: xr.DataTree, features: Any, known: Sequence[type]) -> Any:
+def _posterior_groups(posterior: xr.DataTree) -> dict[str, xr.DataTree]:
+    small = stored(posterior)
+    groups = {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
+    return {**groups, "fit": xr.DataTree(small.to_dataset())}
+
+
+def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Sequence[type]) -> UtilityEstimate:
     utility = tree.children["utility"]
     if "class" in utility.attrs:
-        return records.from_tree(utility, known=known)
+        return from_tree(utility, known=known)
     if "features" in utility.children:
-        features = records.from_tree(utility.children["features"], known=known)
-    elif features is None:
+        features = from_tree(utility.children["features"], known=known)
+    if features is None:
         raise ValueError("a run with features of the user's own: pass them again as features=")
-    posterior = None
-    if "fit" in tree.children:
-        groups = {name: tree.children[name] for name in POSTERIOR_GROUPS if name in tree.children}
-        posterior = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
-    quality = records.from_tree(utility.children["quality"])
-    estimate = LinearUtility(
-        features,
-        utility.dataset["weights"].values,
-        float(utility.attrs["discount"]),
-        quality,
-        posterior,
-        float(utility.attrs["scale"]),
-    )
+    weights, discount = utility.dataset["weights"].values, float(utility.attrs["discount"])
+    quality, scale = from_tree(utility.children["quality"]), float(utility.attrs["scale"])
+    if "fit" not in tree.children:
+        return LinearProgramUtility(features, weights, discount, quality, scale)
+    groups = {name: tree.children[name] for name in POSTERIOR_GROUPS if name in tree.children}
+    posterior = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
+    sampled = PosteriorUtility(features, weights, discount, quality, posterior, scale)
     if "average" not in tree.children:
-        return estimate
+        return sampled
     average = tree.children["average"]
-    base = records.from_tree(average.children["base"], known=known) if "base" in average.children else features
+    base = from_tree(average.children["base"], known=known) if "base" in average.children else features
     arrays: dict[str, Any] = {name: average.dataset[name].values for name in AVERAGE}
-    return AveragedUtility(**vars(estimate), base=base, **arrays)
+    return AveragedUtility(sampled=sampled, quality=quality, base=base, **arrays)

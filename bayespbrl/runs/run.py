@@ -1,4 +1,4 @@
-"""A run that is kept on disk: start it, resume it, load it."""
+"""A run on disk: start it, resume it, load it."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -15,9 +15,11 @@ from bayespbrl.improvement.schedules import ConstantBound
 from bayespbrl.learner import Learner
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
+from bayespbrl.queries import HighestUtility
 from bayespbrl.runs.directory import RunDirectory, fresh_directory
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility import UtilityEstimate
 
 
 def start(
@@ -27,20 +29,21 @@ def start(
     features: Any = None,
     policy: Any = None,
     schedule: Any = None,
-    **settings: Any,
+    query: Any = None,
+    **options: Any,
 ) -> Learner:
-    """A new learner that keeps everything it does in a run directory.
+    """A new learner that keeps its events in a run directory.
 
     Args:
       env: as of `Learner`.
       directory: must not exist; a fresh one under `runs/` when None.
-      features, policy, schedule, **settings: as of `Learner`. `expert="other"` says that neither the simulated expert
-        nor a person at a terminal answers, so that `bayespbrl resume` does not let one of them go on.
+      features, policy, schedule, query, **options: as of `Learner`. `expert="other"` is for an expert of your own: such
+        a run continues in Python only, not with `bayespbrl resume`.
 
     Raises:
       ValueError: bad options, or a directory that exists; nothing is left behind then.
     """
-    learner = Learner(env, features=features, policy=policy, schedule=schedule, **settings)
+    learner = Learner(env, features=features, policy=policy, schedule=schedule, query=query, **options)
     log = RunDirectory.create(
         fresh_directory(learner.settings.env) if directory is None else directory, learner.settings
     )
@@ -48,43 +51,58 @@ def start(
 
 
 def resume(
-    directory: Path | str, *, env: Any = None, features: Any = None, policy: Any = None, schedule: Any = None
+    directory: Path | str,
+    *,
+    env: Any = None,
+    features: Any = None,
+    policy: Any = None,
+    schedule: Any = None,
+    query: Any = None,
 ) -> Learner:
-    """The learner of a run directory as it was after its last complete event; it goes on writing there.
+    """The learner of a run directory after its last complete event; it keeps further events there.
 
     Args:
-      directory: a run directory, of a run that was stopped, killed or finished.
-      env, features, policy, schedule: what the run was started with, where these were objects of the user's.
+      directory: of a run that was stopped, killed or finished.
+      env, features, policy, schedule, query: the objects that the run was started with, where these were your own.
 
     Raises:
       ValueError: a directory that is no run, or a file in it that is truncated or foreign.
     """
     log = RunDirectory.open(directory)
-    learner = _restored(log, env, features, policy, schedule)
+    learner = _restored(log, env, features, policy, schedule, query)
     log.drop_partial_line()
-    log.write_summary(learner.state)  # a process killed between an event and its summary left an old one
+    log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
     return learner.logged(log)
 
 
 def load(
-    directory: Path | str, *, env: Any = None, features: Any = None, policy: Any = None, schedule: Any = None
+    directory: Path | str,
+    *,
+    env: Any = None,
+    features: Any = None,
+    policy: Any = None,
+    schedule: Any = None,
+    query: Any = None,
 ) -> "Run":
-    """Read a run, finished or in progress, without changing it. Arguments and errors as of `resume`.
+    """A run, finished or in progress, read without changing it. Arguments and errors as of `resume`.
 
-    A schedule of the user's own is only needed to go on, not to read.
+    A schedule and a query rule of your own are needed only to continue a run, not to read it.
     """
     log = RunDirectory.open(directory)
-    if log.settings.schedule == "other" and schedule is None:
+    if log.settings.update.schedule == "other" and schedule is None:
         schedule = ConstantBound()
-    return Run(log.path, _restored(log, env, features, policy, schedule))
+    if log.settings.questions.query == "other" and query is None:
+        query = HighestUtility()
+    return Run(log.path, _restored(log, env, features, policy, schedule, query))
 
 
-def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedule: Any) -> Learner:
+def _restored(log: RunDirectory, env: Any, features: Any, policy: Any, schedule: Any, query: Any) -> Learner:
     settings = log.settings
     for part, own, given in (
-        ("features", settings.features, features),
-        ("policy", settings.policy, policy),
-        ("schedule", settings.schedule, schedule),
+        ("features", settings.features.features, features),
+        ("policy", settings.rollouts.policy, policy),
+        ("schedule", settings.update.schedule, schedule),
+        ("query", settings.questions.query, query),
     ):
         if (own == "other") != (given is not None):
             had, expected = ("with", "it again as") if own == "other" else ("without", "no")
@@ -98,6 +116,7 @@ def _restored(log: "RunDirectory", env: Any, features: Any, policy: Any, schedul
             features=features,
             policy=policy,
             schedule=schedule,
+            query=query,
             entries=log.entries(features=features, known=() if policy is None else (type(policy),)),
             kept=settings,
         )
@@ -113,7 +132,7 @@ class Run:
 
     Attributes:
       path: its directory.
-      learner: the learner in its last state, detached from the directory.
+      learner: the learner in its last state; it keeps no events.
     """
 
     path: Path
@@ -125,7 +144,7 @@ class Run:
 
     @property
     def policy(self) -> Actor:
-        """The last policy: `run.policy.act(observation)` is an action for the environment, as it was given."""
+        """The last policy. `run.policy.act(observation)` is an action; both are of the environment as it was given."""
         environment, given = self.learner.environment, self.learner.given
         return Actor(
             self.learner.policy,
@@ -149,17 +168,18 @@ class Run:
         return self.learner.iterations
 
     @property
-    def estimate(self) -> Any:
+    def estimate(self) -> UtilityEstimate | None:
         """The last utility estimate; None before the first."""
         return self.learner.estimate
 
     @property
     def posterior(self) -> xr.DataTree | None:
-        """Draws of the last fit in ArviZ's schema; None where the utility is no posterior."""
-        return getattr(self.estimate, "posterior", None)
+        """Posterior draws of the last fit in ArviZ's schema; None where the estimate is no posterior."""
+        sampled = None if self.estimate is None else self.estimate.sampled
+        return None if sampled is None else sampled.posterior
 
     def evaluate(self, episodes: int = 100, seed: int = 0) -> float:
-        """Mean undiscounted return of fresh episodes under the last, stochastic policy."""
+        """Mean undiscounted return of the last, stochastic policy over fresh episodes."""
         learner = self.learner
         return float(
             rollouts.returns(
@@ -167,12 +187,12 @@ class Run:
                 learner.policy,
                 key=jax.random.key(seed),
                 episodes=episodes,
-                max_steps=learner.settings.max_steps,
+                max_steps=learner.settings.rollouts.max_steps,
             ).total.mean()
         )
 
     def report(self, format: str = "html") -> Path:
-        """Write the diagnostic report into the run directory, as `report.html` or `report.md`, and return its path."""
-        from bayespbrl.diagnostics.report import write_report  # stands above this module, and reads with it
+        """Write the diagnostic report, `report.html` or `report.md`, into the run directory and return its path."""
+        from bayespbrl.diagnostics.report import write_report  # here, since the report imports this module
 
         return write_report(self.path, format=format, env=self.learner.environment, features=self.learner.features)

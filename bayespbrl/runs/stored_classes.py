@@ -1,7 +1,7 @@
-"""Frozen dataclasses of arrays and numbers as xarray trees, and back: how policies, features and estimates are stored.
+"""Policies, features and estimates as xarray trees, and back: how a run stores frozen dataclasses.
 
-Arrays become variables, everything else becomes one JSON attribute, dataclasses within become groups. No pickle: what
-is read back are arrays and numbers, put into a class that `STORED` names or that the caller passed.
+Arrays become variables, nested dataclasses become groups, and all other fields together become one JSON attribute.
+Nothing is pickled: a file holds arrays and numbers, which are put into a class that `STORED` names or the caller passed.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ import xarray as xr
 
 from bayespbrl.features import JointRadialBasis, OneHot, RadialBasis, StateActionProduct
 from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, TabularPolicy
-from bayespbrl.utility.estimate import FitQuality, KnownReward
+from bayespbrl.utility import FitQuality, KnownReward
 
-# The names by which files know our classes. A name never changes; the class behind it may move.
+# The names of our classes in files. A name never changes; the class may move to another module.
 STORED: dict[str, type] = {
     "fit-quality": FitQuality,
     "gaussian-process": GaussianProcessPolicy,
@@ -31,20 +31,20 @@ STORED: dict[str, type] = {
     "tabular": TabularPolicy,
 }
 NAMES = {kind: name for name, kind in STORED.items()}
-OWN = "own:"  # stands before the name of a class of the user's
+OWN = "own:"  # prefix of the name of a user's class
 
 
-def to_tree(record: Any) -> xr.DataTree:
-    """A dataclass instance as a tree.
+def to_tree(instance: Any) -> xr.DataTree:
+    """The tree of a dataclass instance.
 
     Raises:
-      ValueError: something that is no dataclass, or a field that is no array, number, text, None or dataclass.
+      ValueError: not a dataclass instance; a field that is no array, number, text, tuple, None or dataclass.
     """
-    if not dataclasses.is_dataclass(record) or isinstance(record, type):
-        raise ValueError(f"record: expected a dataclass to store, got {type(record).__name__}")
+    if not dataclasses.is_dataclass(instance) or isinstance(instance, type):
+        raise ValueError(f"stored class: expected an instance of a dataclass, got {type(instance).__name__}")
     arrays, plain, children = {}, {}, {}
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
+    for field in dataclasses.fields(instance):
+        value = getattr(instance, field.name)
         if isinstance(value, np.ndarray | jax.Array):
             array = np.asarray(value)
             arrays[field.name] = ([f"{field.name}_{axis}" for axis in range(array.ndim)], array)
@@ -53,23 +53,25 @@ def to_tree(record: Any) -> xr.DataTree:
         elif value is None or isinstance(value, bool | int | float | str | tuple | np.generic):
             plain[field.name] = value.item() if isinstance(value, np.generic) else value
         else:
-            kind = type(value).__name__
-            raise ValueError(f"record: {type(record).__name__}.{field.name} is a {kind}, which cannot be stored")
-    attributes = {"class": stored_name(type(record)), "fields": json.dumps(plain)}
+            raise ValueError(
+                f"stored class: expected an array, number or text in {type(instance).__name__}.{field.name}, "
+                f"got {type(value).__name__}"
+            )
+    attributes = {"class": stored_name(type(instance)), "fields": json.dumps(plain)}
     return xr.DataTree(xr.Dataset(arrays, attrs=attributes), children=children)
 
 
 def from_tree(tree: xr.DataTree, *, known: Iterable[type] = ()) -> Any:
-    """The dataclass instance that `to_tree` made the tree from.
+    """The dataclass instance of a tree that `to_tree` returned.
 
     Args:
       tree: loaded into memory.
-      known: classes outside this package that may be made.
+      known: classes of the user's that the tree may name.
 
     Raises:
-      ValueError: a class that is neither ours nor known, or fields that it does not take.
+      ValueError: a class that is neither ours nor in `known`, or fields that do not fit the class.
     """
-    kind = _class(str(tree.attrs.get("class", "")), tuple(known))
+    kind = _class_named(str(tree.attrs.get("class", "")), tuple(known))
     fields = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in json.loads(tree.attrs["fields"]).items()
@@ -79,18 +81,18 @@ def from_tree(tree: xr.DataTree, *, known: Iterable[type] = ()) -> Any:
     try:
         return kind(**fields, **arrays, **children)
     except TypeError as error:
-        raise ValueError(f"record: stored {kind.__name__} does not fit this version's ({error})") from error
+        raise ValueError(f"stored class: the fields do not fit {kind.__name__} ({error})") from error
 
 
 def stored_name(kind: type) -> str:
-    """The name by which files know a class: ours by `STORED`, the user's by its own name."""
+    """The name of a class in files: that in `STORED`, or the qualified name of a user's class."""
     return NAMES.get(kind, OWN + kind.__qualname__)
 
 
-def _class(name: str, known: tuple[type, ...]) -> type:
+def _class_named(name: str, known: tuple[type, ...]) -> type:
     for candidate in known:
         if name == stored_name(candidate):
             return candidate
     if name in STORED:
         return STORED[name]
-    raise ValueError(f"record: expected a class of bayespbrl or one that was passed again, got {name!r}")
+    raise ValueError(f"stored class: expected a class of bayespbrl or one that was passed again, got {name!r}")

@@ -1,0 +1,121 @@
+"""Step 2, the problem: how the policy is updated, and the data that the updates of an iteration share."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from gymnasium import Space
+from jaxtyping import Float
+
+from bayespbrl import checks
+from bayespbrl.features import StateActionFeatures
+from bayespbrl.improvement.q_function import Critic
+from bayespbrl.trajectories import Trajectory, Transitions
+from bayespbrl.utility.estimate import UtilityEstimate
+
+
+@dataclass(frozen=True)
+class PolicyUpdate:
+    """How the policy is updated in each iteration.
+
+    Attributes:
+      kl_bound: ε of eq. 11, nats.
+      schedule: what decides on the bound of each iteration: `constant`, kl_bound itself; `confidence`, the posterior's
+        confidence that the update is a gain; `other`, a schedule of the user's.
+      updates_per_iteration: most updates of the policy from the same trajectories and utility, until it has moved by
+        most of the bound. Each has the Q of the policy before it; all but the first hold a continuous policy's spread.
+        The paper's is 1.
+      recent_iterations: the update takes the states of so many last iterations; None for those of all. LSTD always has
+        all transitions.
+      update_states: most of these states that the update takes, drawn at random, where they are continuous: it bounds
+        time and memory for long episodes.
+    """
+
+    kl_bound: float = 0.3
+    schedule: str = "constant"
+    updates_per_iteration: int = 1
+    recent_iterations: int | None = None
+    update_states: int = 20_000
+
+    def __post_init__(self) -> None:
+        checks.positive("kl_bound", self.kl_bound)
+        checks.one_of("schedule", self.schedule, ("constant", "confidence", "other"))
+        checks.whole("updates_per_iteration", self.updates_per_iteration)
+        if self.recent_iterations is not None:
+            checks.whole("recent_iterations", self.recent_iterations)
+        checks.whole("update_states", self.update_states)
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateProblem:
+    """What all updates of one iteration share.
+
+    Attributes:
+      steps: N transitions observed so far, under whatever policies.
+      utilities: uᵢ of each.
+      states: those of the update, shape (n, S) or (n,); LSTD always has all transitions.
+      critic: LSTD's options.
+      state_action_features: φ(s, a) of Q.
+      state_features: φ(s) of the constraint on the state distribution (eq. 11); not needed for discrete actions in
+        continuous states.
+      action_space: bounds the actions.
+
+    Raises:
+      ValueError: utilities that do not fit the transitions or are not finite.
+    """
+
+    steps: Transitions
+    utilities: np.ndarray
+    states: np.ndarray
+    critic: Critic
+    state_action_features: StateActionFeatures
+    state_features: Callable[[np.ndarray], np.ndarray]
+    action_space: Space[Any]
+
+    def __post_init__(self) -> None:
+        if self.utilities.shape != (len(self.steps),):
+            raise ValueError(f"utilities: expected shape ({len(self.steps)},), got {self.utilities.shape}")
+        checks.finite("utilities", self.utilities)
+
+    @cached_property
+    def visited(self) -> tuple[np.ndarray, np.ndarray]:
+        """The states and the share of visits of each: discrete ones are counted, not repeated."""
+        if self.states.ndim > 1:
+            return self.states, np.full(len(self.states), 1 / len(self.states))
+        unique, counts = np.unique(self.states, return_counts=True)
+        return unique, counts / len(self.states)
+
+    @cached_property
+    def constrained(self) -> np.ndarray:
+        """φ(s) of the `visited` states, evaluated once for all updates."""
+        return self.state_features(self.visited[0])
+
+
+def step_utilities(
+    utility: UtilityEstimate, steps: Transitions, *, draws: int
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n s"] | None]:
+    """uᵢ of each transition, and under S posterior draws: at most `draws`, None where there are none."""
+    if not draws or utility.sampled is None:
+        return utility.step_utilities(steps), None
+    utilities, drawn = utility.utilities_and_draws(steps.next_states, number=draws)
+    return utilities, drawn.T
+
+
+def states_of_update(
+    trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iteration: int, rng: np.random.Generator
+) -> np.ndarray:
+    """The states that a policy update takes, shape (n, S) or (n,).
+
+    Args:
+      trajectories: all so far, the newest last.
+      options: `recent_iterations` and `update_states`.
+      an_iteration: trajectories in each iteration.
+      rng: picks states where there are too many.
+    """
+    recent = 0 if options.recent_iterations is None else options.recent_iterations * an_iteration
+    states = np.concatenate([trajectory.states[:-1] for trajectory in trajectories[-recent:]])
+    if states.ndim == 1 or len(states) <= options.update_states:
+        return states  # discrete ones are counted, not repeated
+    return states[np.sort(rng.choice(len(states), options.update_states, replace=False))]

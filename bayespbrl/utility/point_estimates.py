@@ -1,0 +1,59 @@
+"""Utilities without a posterior: the linear program's weights (eq. 10), and the known reward as the reference."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bayespbrl.features import StateFeatures
+from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
+from bayespbrl.utility.estimate import WithoutDraws
+from bayespbrl.utility.posterior_utility import linear
+from bayespbrl.utility.quality import FitQuality
+
+
+@dataclass(frozen=True)
+class LinearProgramUtility(WithoutDraws):
+    """u(s′) = wᵀφ(s′) with the weights of the linear program.
+
+    Attributes:
+      features: φ.
+      weights: w in the units of φ, shape (D,).
+      discount: γ of ψ(τ).
+      quality: how far it can be trusted.
+      scale: what the differences were divided by.
+    """
+
+    features: StateFeatures
+    weights: np.ndarray
+    discount: float
+    quality: FitQuality
+    scale: float = 1.0
+
+    def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
+        """wᵀφ(s) of n states."""
+        return linear(self.features(states), self.weights)
+
+    def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
+        """uᵢ = wᵀφ(sᵢ′): the utility of the *next* state, the same convention as in ψ."""
+        return self.utilities(steps.next_states)
+
+    def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
+        """wᵀψ(τ) of each trajectory."""
+        return linear(trajectory_features(trajectories, self.features, discount=self.discount), self.weights)
+
+
+@dataclass(frozen=True)
+class KnownReward(WithoutDraws):
+    """The environment's own reward in place of an estimate: a reference run trained on the hidden reward."""
+
+    quality: FitQuality
+
+    def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
+        """The hidden reward of each transition."""
+        return steps.rewards
+
+    def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
+        """The hidden return of each trajectory."""
+        return np.array([trajectory.total_reward for trajectory in trajectories])
