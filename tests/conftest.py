@@ -1,0 +1,76 @@
+"""What the test files share: shapes checked at run time, one thread a process, and finished runs of each kind."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import get_args
+
+import jaxtyping
+import pytest
+from beartype import BeartypeConf, beartype
+from threadpoolctl import threadpool_limits
+
+# Modules, and packages with all in them, whose shapes (`Float[Array, "k d"]`) are checked at each call. They must not
+# be imported before the hook is installed; processes that tests start are not checked.
+CHECKED = ["bayespbrl.kernels", "bayespbrl.models", "bayespbrl.improvement", "bayespbrl.policies"]
+
+
+def has_shape(hint):
+    """Whether a type annotation names an array with a shape."""
+    shape = isinstance(hint, type) and issubclass(hint, jaxtyping.AbstractArray)
+    return shape or any(map(has_shape, get_args(hint)))
+
+
+def check_shapes(function):
+    """`function`, which refuses arrays of other shapes and leaves all other annotations alone.
+
+    Those are the static type checker's, and what a user may get wrong is refused by the function itself.
+    """
+    hints = function.__annotations__
+    function.__annotations__ = {name: hint for name, hint in hints.items() if has_shape(hint)}
+    return beartype(conf=BeartypeConf(is_pep484_tower=True))(function)  # an int may stand for a float
+
+
+jaxtyping.install_import_hook(CHECKED, "conftest.check_shapes")
+
+# Test processes run side by side. With one thread each, the linear algebra of one does not wait for that of another:
+# here, where NumPy has its threads already, and in the processes that tests start.
+threadpool_limits(1)
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+import bayespbrl
+
+QUICK = {"max_steps": 20, "evaluation_episodes": 3}
+
+
+@pytest.fixture(scope="session")
+def gridworld_run(tmp_path_factory):
+    """Directory of a finished Gridworld run, posterior mean, second answer wrong, third a tie; not to be changed."""
+    directory = tmp_path_factory.mktemp("runs") / "gridworld"
+    right, wrong = bayespbrl.ReturnExpert(), bayespbrl.NoisyExpert(bayespbrl.ReturnExpert(), wrong_answers=1.0, seed=0)
+    answers = iter([right, wrong, lambda first, second: "tie", right])
+    learner = bayespbrl.start("gridworld", directory, iterations=3, seed=7, **QUICK)
+    learner.run(lambda first, second: next(answers)(first, second))
+    return directory
+
+
+@pytest.fixture
+def gridworld_copy(gridworld_run, tmp_path):
+    """A copy of `gridworld_run`, without its reports, to be changed."""
+    return Path(shutil.copytree(gridworld_run, tmp_path / "copy", ignore=shutil.ignore_patterns("report*")))
+
+
+@pytest.fixture(scope="session")
+def swing_up_run(tmp_path_factory):
+    """Directory of a finished swing-up run with all options of uncertainty; not to be changed."""
+    directory = tmp_path_factory.mktemp("runs") / "swing-up"
+    uncertainty = {"schedule": "confidence", "query": "information-when-unsure", "hyperparameters": "averaged"}
+    options = {"updates_per_iteration": 2, "unasked_iterations": 1, "iterations": 4, "centres": 30, "seed": 3}
+    bayespbrl.start("swing-up", directory, **uncertainty, **options, **QUICK).run(bayespbrl.ReturnExpert())
+    return directory
+
+
+@pytest.fixture
+def swing_up_copy(swing_up_run, tmp_path):
+    """A copy of `swing_up_run`, without its reports, to be changed."""
+    return Path(shutil.copytree(swing_up_run, tmp_path / "copy", ignore=shutil.ignore_patterns("report*")))
