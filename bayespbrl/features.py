@@ -5,7 +5,7 @@ dataclass of arrays and numbers, so that a run can store what it used. A user's 
 observations; `checked_features` calls it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from bayespbrl.checks import matrix, positive, whole
 from bayespbrl.kernels import as_periods, median_bandwidths, radial_basis
+from bayespbrl.trajectories import Trajectory, Transitions
 
 StateFeatures = Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
 StateActionFeatures = Callable[[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
@@ -209,6 +210,42 @@ def draw_state_action_features(
         action_high=high,
         action_range=width,
     )
+
+
+@dataclass(frozen=True)
+class FeatureSource:
+    """Draws the features of an environment at observed samples, or takes the user's φ(s).
+
+    Attributes:
+      observation_space, action_space: of the environment.
+      period: of each observation dimension, infinite where not periodic; None for none.
+      own: φ(s) of the user's; None: drawn.
+    """
+
+    observation_space: Space[Any]
+    action_space: Space[Any]
+    period: ArrayLike | None = None
+    own: StateFeatures | None = None
+
+    def of_states(
+        self, trajectories: Sequence[Trajectory], options: RadialBasisOptions, *, rng: np.random.Generator
+    ) -> StateFeatures:
+        """φ(s), the user's or drawn at all states of the trajectories."""
+        if self.own is not None:
+            own = self.own
+            return lambda states: checked_features(own, states)
+        observed = np.concatenate([trajectory.states for trajectory in trajectories])
+        return draw_state_features(self.observation_space, observed, self._periodic(options), rng=rng)
+
+    def of_steps(
+        self, steps: Transitions, options: RadialBasisOptions, *, rng: np.random.Generator
+    ) -> JointRadialBasis | StateActionProduct:
+        """φ(s, a), drawn at observed transitions."""
+        spaces = (self.observation_space, self.action_space)
+        return draw_state_action_features(*spaces, steps.states, steps.actions, self._periodic(options), rng=rng)
+
+    def _periodic(self, options: RadialBasisOptions) -> RadialBasisOptions:
+        return replace(options, period=self.period)
 
 
 def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."]) -> Float[np.ndarray, "n d"]:

@@ -12,14 +12,7 @@ from bayespbrl import events, queries, rollouts
 from bayespbrl.envs.opening import as_given, environment_attribute, environment_name, given_by_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
-from bayespbrl.features import (
-    RadialBasisOptions,
-    StateActionFeatures,
-    StateFeatures,
-    checked_features,
-    draw_state_action_features,
-    draw_state_features,
-)
+from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
 from bayespbrl.improvement.problem import UpdateProblem, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
@@ -38,7 +31,6 @@ from bayespbrl.utility.inference import estimate
 COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED = range(8)
 # Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
-UNASKED_SIGNAL = 0.5  # from this signal on an iteration may ask nothing
 
 
 class Learner:
@@ -89,16 +81,18 @@ class Learner:
         )
         rollouts.step_limit(self.environment, self.settings.rollouts.max_steps)  # an error now, not at the first step
         self.features = features
+        period = environment_attribute(self.environment, "observation_period")
+        spaces = (self.environment.observation_space, self.environment.action_space)
+        self.feature_source = FeatureSource(*spaces, period, features)
         self.schedule = _chosen("schedule", schedule, self.settings.update.schedule, schedules.SCHEDULES)
         self.query_rule = _chosen("query", query, self.settings.questions.query, queries.QUERY_RULES)
         self.log: Log | None = None
         if own_policy is None:
             own_policy = initial_policy(
                 self.settings.rollouts.policy,
-                self.environment.observation_space,
-                self.environment.action_space,
+                *spaces,
                 action_scale=self.settings.rollouts.initial_action_scale,
-                period=self._period,
+                period=period,
             )
         self.state = events.replay(LearnerState(own_policy), entries)
 
@@ -219,20 +213,14 @@ class Learner:
             hold=options.exploration_hold,
         )
         new = range(len(state.trajectories), len(state.trajectories) + len(collected))
+        signal = None if state.bound is None else state.bound.signal
         rng = self._rng(CHOOSE, state.iteration)
         wanted, candidates = 0, tuple[int, ...]()
         if state.estimate is None:
             wanted, candidates = questions.first_queries, queries.random_candidates(new, rng=rng)
-        elif not self._without_question():
-            situation = QuerySituation(
-                new,
-                (*state.trajectories, *collected),
-                state.shown,
-                state.preferences.undominated[-1],
-                state.estimate,
-                None if state.bound is None else state.bound.signal,
-                rng,
-            )
+        elif not questions.skips(state.preferences, state.unasked, state.estimate, signal):
+            known, best = (*state.trajectories, *collected), state.preferences.undominated[-1]
+            situation = QuerySituation(new, known, state.shown, best, state.estimate, signal, rng)
             wanted, candidates = questions.queries_per_iteration, queries.candidates(self.query_rule, situation)
         event = {
             "event": "collected",
@@ -242,18 +230,6 @@ class Learner:
             "seconds": time.perf_counter() - began,
         }
         self._record(event, trajectories=collected)
-
-    def _without_question(self) -> bool:
-        """Whether the next iteration asks nothing (`Questions.unasked_iterations`)."""
-        state = self.state
-        # Decision: at most half the answers so far. Draws from two or three answers agree even where they are wrong.
-        most = min(self.settings.questions.unasked_iterations, state.preferences.answers // 2)
-        if state.unasked >= most or not state.preferences.pairs:
-            return False
-        if state.bound is None or state.bound.signal is None:
-            return True  # without a signal the setting alone decides
-        converged = state.estimate is not None and state.estimate.quality.converged
-        return converged and state.bound.signal >= UNASKED_SIGNAL
 
     def _show(self) -> None:
         """Step 4: the next question, the best candidate against the newest of the undominated."""
@@ -306,7 +282,7 @@ class Learner:
         rng = self._rng(FEATURES, 2 * state.iteration)
         return estimate(
             Comparisons.among(state.trajectories, state.preferences.pairs, discount=settings.trajectory_discount),
-            self._state_features(settings.features.of_utility(self._period), rng),
+            self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),
             settings.estimation,
             settings.model,
             seed=int(self._rng(FIT, state.iteration).integers(2**31)),
@@ -316,7 +292,7 @@ class Learner:
         """Step 2: an update is proposed, the schedule decides on its bound, the update is applied."""
         settings, iteration = self.settings, self.state.iteration
         rng, key = self._rng(FEATURES, 2 * iteration + 1), self._key(IMPROVE, iteration)
-        state_action_features = self.state_action_features(steps, rng=rng)
+        state_action_features = self.feature_source.of_steps(steps, settings.features.of_critic, rng=rng)
         constant = isinstance(self.schedule, schedules.ConstantBound)  # looks at no draws
         utilities, draws = step_utilities(utility, steps, draws=0 if constant else SCHEDULE_DRAWS)
         problem = UpdateProblem(
@@ -330,7 +306,7 @@ class Learner:
             ),
             settings.critic,
             state_action_features,
-            self._state_features(settings.features.of_critic(self._period), rng),
+            self.feature_source.of_states(self.state.trajectories, settings.features.of_critic, rng=rng),
             self.environment.action_space,
         )
         proposed = propose(self.state.policy, problem, key=key, utility_draws=draws)
@@ -344,29 +320,6 @@ class Learner:
             updates=settings.update.updates_per_iteration,
         )
         return improved, bound
-
-    def state_action_features(self, steps: Transitions, *, rng: np.random.Generator) -> StateActionFeatures:
-        """φ(s, a) of Q, drawn at observed transitions as the settings say."""
-        return draw_state_action_features(
-            self.environment.observation_space,
-            self.environment.action_space,
-            steps.states,
-            steps.actions,
-            self.settings.features.of_critic(self._period),
-            rng=rng,
-        )
-
-    def _state_features(self, options: RadialBasisOptions, rng: np.random.Generator) -> StateFeatures:
-        """φ(s): the user's, or drawn anew at states observed so far."""
-        if self.features is not None:
-            features = self.features
-            return lambda states: checked_features(features, states)
-        observed = np.concatenate([trajectory.states for trajectory in self.state.trajectories])
-        return draw_state_features(self.environment.observation_space, observed, options, rng=rng)
-
-    @property
-    def _period(self) -> Any:
-        return environment_attribute(self.environment, "observation_period")
 
     # Memory and chance.
 

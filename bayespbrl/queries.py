@@ -16,12 +16,13 @@ from scipy.special import entr
 
 from bayespbrl import checks
 from bayespbrl.models.likelihoods import Likelihood, prob
-from bayespbrl.preferences import Query
+from bayespbrl.preferences import Preferences, Query
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
 
 # Posterior draws that a rule looks at: enough to order ten candidates, in hundredths of a second.
 QUERY_DRAWS = 500
+UNASKED_SIGNAL = 0.5  # from this signal on an iteration may ask nothing
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Questions:
       queries_per_iteration, first_queries: M, in later iterations and in the first.
       unasked_iterations: most iterations in a row without a question, at most half the answers so far (ties count),
         once there is a preference. With a schedule that has a signal, only while the posterior has converged and the
-        signal is at least 0.5. The paper's is 0.
+        signal is at least `UNASKED_SIGNAL`. The paper's is 0.
     """
 
     query: str = "highest-utility"
@@ -46,6 +47,15 @@ class Questions:
         checks.whole("queries_per_iteration", self.queries_per_iteration)
         checks.whole("first_queries", self.first_queries)
         checks.whole("unasked_iterations", self.unasked_iterations, 0)
+
+    def skips(self, preferences: Preferences, unasked: int, estimate: UtilityEstimate, signal: float | None) -> bool:
+        """Whether the next iteration asks nothing, after `unasked` in a row that asked nothing.
+
+        Decision: at most half the answers so far. Draws from two or three answers agree even where they are wrong.
+        """
+        if unasked >= min(self.unasked_iterations, preferences.answers // 2) or not preferences.pairs:
+            return False
+        return signal is None or (estimate.quality.converged and signal >= UNASKED_SIGNAL)
 
 
 @dataclass(frozen=True)

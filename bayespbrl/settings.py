@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from numpy.typing import ArrayLike
-
 from bayespbrl import checks
 from bayespbrl.features import RadialBasisOptions
 from bayespbrl.improvement.problem import PolicyUpdate
@@ -49,13 +47,15 @@ class Features:
         if not isinstance(self.normalised_utility, bool):
             raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")
 
-    def of_critic(self, period: ArrayLike | None) -> RadialBasisOptions:
-        """Those of Q and V; `period` of each observation dimension, None for none."""
-        return RadialBasisOptions(self.centres, self.bandwidth_factor, period)
+    @property
+    def of_critic(self) -> RadialBasisOptions:
+        """Those of Q and V."""
+        return RadialBasisOptions(self.centres, self.bandwidth_factor)
 
-    def of_utility(self, period: ArrayLike | None) -> RadialBasisOptions:
+    @property
+    def of_utility(self) -> RadialBasisOptions:
         """Those of the utility."""
-        return RadialBasisOptions(self.centres, self.utility_bandwidth_factor, period, self.normalised_utility)
+        return RadialBasisOptions(self.centres, self.utility_bandwidth_factor, normalised=self.normalised_utility)
 
 
 @dataclass(frozen=True)
