@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -129,3 +130,9 @@ def test_studies_of_different_seeds_are_joined_and_their_answers_are_shares(tmp_
     assert "error: " in refused.stderr
     assert "expected tables with different seeds, got seed 1 twice" in refused.stderr
     assert refused.returncode == 2
+
+
+def test_the_index_of_the_results_names_every_file_once_and_nothing_else():
+    results = BENCHMARKS / "results"
+    named = re.findall(r"^\| \[([^\]]+)\]\(\1\) \|", (results / "README.md").read_text(), flags=re.MULTILINE)
+    assert sorted(named) == sorted(path.name for path in results.iterdir() if path.name != "README.md")
