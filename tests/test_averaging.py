@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 
 from bayespbrl import Learner, ReturnExpert, queries
-from bayespbrl import learner as cycle
 from bayespbrl.features import OneHot, RadialBasis
+from bayespbrl.models import PreferenceModel
+from bayespbrl.queries import InformationWhenUnsure
 from bayespbrl.runs.iteration_files import read_iteration
 from bayespbrl.runs.run import start
 from bayespbrl.trajectories import Trajectory, trajectory_features
 from bayespbrl.utility.averaging import BANDWIDTH_MULTIPLES, MOST_BANDWIDTHS, average_utility
-from bayespbrl.utility.estimate import LinearUtility, estimate_utility
+from bayespbrl.utility.comparisons import Comparisons
 from bayespbrl.utility.hyperparameters import STEEPNESS_MULTIPLES, choose_hyperparameters
+from bayespbrl.utility.inference import estimate_utility
 
 LINE = RadialBasis(np.linspace(-1, 1, 5)[:, None], np.array([0.4]), np.array([np.inf]), normalised=True)
 PAIRS = [(0, 1), (0, 2), (3, 2)]
@@ -30,12 +32,11 @@ def walks(number=4):
 
 
 def averaged(features, trajectories, pairs, *, likelihood="logistic", seed=0):
-    options = {"discount": 1.0, "likelihood": likelihood}
-    choice = choose_hyperparameters(trajectories, pairs, features, **options)
-    chosen = estimate_utility(
-        trajectories, pairs, choice.features, method="posterior-mean", steepness=choice.steepness, **options
-    )
-    return average_utility(chosen, trajectories, pairs, features, seed=seed, **options)
+    comparisons, model = Comparisons.among(trajectories, pairs, discount=1.0), PreferenceModel(likelihood=likelihood)
+    choice = choose_hyperparameters(comparisons, features, model)
+    given = PreferenceModel(likelihood=likelihood, steepness=choice.model.steepness)
+    sampled = estimate_utility(comparisons, choice.features, given, method="posterior-mean")
+    return average_utility(sampled, comparisons, features, model=model, seed=seed)
 
 
 def test_the_pairs_that_it_satisfies_are_counted_by_the_average_and_not_by_the_likeliest_setting():
@@ -46,7 +47,7 @@ def test_the_pairs_that_it_satisfies_are_counted_by_the_average_and_not_by_the_l
         estimate = averaged(LINE, trajectories, pairs)
         mixed = estimate.trajectory_utilities(trajectories)
         assert estimate.quality.pairs_satisfied == sum(mixed[i] > mixed[j] for i, j in pairs)
-        own = LinearUtility.trajectory_utilities(estimate, trajectories)
+        own = estimate.sampled.trajectory_utilities(trajectories)
         if estimate.quality.pairs_satisfied != sum(own[i] > own[j] for i, j in pairs):
             return
     pytest.fail("no case in which the two differ")
@@ -97,13 +98,14 @@ def test_a_trajectory_is_worth_the_sum_of_its_states_in_the_mean_and_in_every_dr
         of_states = estimate.state_draws(states, number=number)
         np.testing.assert_allclose(drawn, of_states.reshape(len(drawn), 4, 6).sum(axis=2), atol=1e-10)
     assert len(drawn) == 1
-    with pytest.raises(ValueError, match="number: expected at least 1 draw, got 0"):
+    with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
         estimate.state_draws(states, number=0)
 
 
 def test_mean_and_draws_in_one_pass_are_those_of_two():
     trajectories = walks()
-    one = estimate_utility(trajectories, PAIRS, LINE, method="posterior-mean", discount=1.0)
+    comparisons = Comparisons.among(trajectories, PAIRS, discount=1.0)
+    one = estimate_utility(comparisons, LINE, PreferenceModel(), method="posterior-mean")
     for estimate in (averaged(LINE, trajectories, PAIRS), one):
         mean, draws = estimate.utilities_and_draws(STATES, number=20)
         np.testing.assert_allclose(mean, estimate.utilities(STATES), rtol=1e-12)
@@ -158,9 +160,8 @@ def learner_report(directory):
 
 
 @pytest.mark.parametrize("sure", [0.0, 1.1])
-def test_an_unsure_learner_asks_for_information_about_all_that_was_never_shown(sure, monkeypatch):
-    monkeypatch.setattr(cycle, "SURE_SIGNAL", sure)
-    run = Learner("swing-up", iterations=4, centres=20, **ALL, **QUICK)
+def test_an_unsure_learner_asks_for_information_about_all_that_was_never_shown(sure):
+    run = Learner("swing-up", iterations=4, centres=20, **(ALL | {"query": InformationWhenUnsure(sure)}), **QUICK)
     newcomers, old = [], 0
     while questions := run.ask():
         (question,) = questions

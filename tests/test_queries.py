@@ -5,23 +5,48 @@ import pytest
 
 from bayespbrl.models.likelihoods import Logistic, Mixed, Probit, WithLapses
 from bayespbrl.queries import (
+    QUERY_RULES,
+    InformationWhenUnsure,
+    QuerySituation,
+    candidates,
     expected_information,
-    highest_utility_candidates,
-    posterior_candidates,
     probability_better,
     random_candidates,
     show,
 )
 
 
+class Draws:
+    """An estimate whose trajectories are the numbers of columns of a table of draws."""
+
+    def __init__(self, table, likelihood):
+        self.table, self.likelihood = table, likelihood
+
+    def trajectory_draws(self, trajectories, *, number=None):
+        return self.table[:, list(trajectories)]
+
+    def trajectory_utilities(self, trajectories):
+        return self.table[:, list(trajectories)].mean(axis=0)
+
+
+def situation(utilities, incumbent, *, likelihood=None, rng=None, shown=(), signal=None, new=None):
+    """Newcomers 0 … n − 1 and the incumbent n."""
+    table, number = np.column_stack([utilities, incumbent]), utilities.shape[1]
+    likelihood = Logistic(1.0) if likelihood is None else likelihood
+    rng = np.random.default_rng(0) if rng is None else rng
+    new = range(number) if new is None else new
+    return QuerySituation(
+        new, range(number + 1), frozenset({number, *shown}), number, Draws(table, likelihood), signal, rng
+    )
+
+
+def order(rule, *arguments, **options):
+    return candidates(QUERY_RULES[rule], situation(*arguments, **options))
+
+
 def test_highest_utility_comes_first_and_equals_stay_in_their_order():
-    assert highest_utility_candidates([10, 11, 12, 13], np.array([0.5, -1.0, 2.0, 0.5])) == (12, 10, 13, 11)
-    assert highest_utility_candidates([4, 5, 6], np.zeros(3)) == (4, 5, 6)
-
-
-def test_a_utility_for_each_trajectory_is_demanded():
-    with pytest.raises(ValueError, match="utilities: expected one for each of 3"):
-        highest_utility_candidates([4, 5, 6], np.zeros(2))
+    assert order("highest-utility", np.array([[0.5, -1.0, 2.0, 0.5]]), np.zeros(1)) == (2, 0, 3, 1)
+    assert order("highest-utility", np.zeros((1, 3)), np.zeros(1)) == (0, 1, 2)
 
 
 def test_random_candidates_are_a_uniform_permutation():
@@ -55,7 +80,6 @@ def test_a_question_names_the_two_and_holds_them_in_the_order_shown():
         assert query.number == number
 
 
-COIN = {"likelihood": Logistic(1.0), "rng": np.random.default_rng(0)}
 # Four draws of three newcomers; the incumbent is 0 in each. Better in 1, 3 and 2 of the four draws; the mean is highest
 # for the first, which is far better in one draw.
 DRAWS = np.array([[9.0, 1.0, 2.0], [-1.0, 1.0, 2.0], [-1.0, 1.0, -2.0], [-1.0, -1.0, -2.0]])
@@ -71,43 +95,33 @@ def test_probability_better_counts_draws_and_half_of_the_equal_ones():
 
 
 def test_rules_order_the_same_draws_each_in_its_way():
-    assert highest_utility_candidates([7, 8, 9], DRAWS.mean(axis=0)) == (7, 8, 9)
-    assert posterior_candidates("probably-better", [7, 8, 9], DRAWS, ZERO, **COIN) == (8, 9, 7)
+    assert order("highest-utility", DRAWS, ZERO) == (0, 1, 2)
+    assert order("probably-better", DRAWS, ZERO) == (1, 2, 0)
     # variances of the order 3/16, 3/16, 1/4: the even match first, then the equal ones by their mean
-    assert posterior_candidates("disagreement", [7, 8, 9], DRAWS, ZERO, **COIN) == (9, 7, 8)
+    assert order("disagreement", DRAWS, ZERO) == (2, 0, 1)
     # a logistic answer at ±1 is a vague one; at ±2 and evenly split it tells most
-    assert posterior_candidates("information", [7, 8, 9], DRAWS, ZERO, **COIN)[0] == 9
+    assert order("information", DRAWS, ZERO)[0] == 2
 
 
 def test_candidates_that_the_rule_cannot_tell_apart_come_by_their_mean_then_in_their_order():
     utilities = np.array([[1.0, 3.0, 2.0, 3.0], [1.0, 3.0, 2.0, 3.0]])
     for rule in ("probably-better", "disagreement", "information"):
         likelihood = Mixed(1e9, 1e9)  # every answer is certain, so that none tells anything
-        chosen = posterior_candidates(
-            rule, [4, 5, 6, 7], utilities, np.zeros(2), likelihood=likelihood, rng=np.random.default_rng(0)
-        )
-        assert chosen == (5, 7, 6, 4)
+        assert order(rule, utilities, np.zeros(2), likelihood=likelihood) == (1, 3, 2, 0)
 
 
 def test_thompson_ranks_by_one_draw_and_picks_each_draw_as_often():
     rng = np.random.default_rng(2)
-    drawn = [
-        posterior_candidates("thompson", [7, 8, 9], DRAWS, ZERO, likelihood=Logistic(1.0), rng=rng) for _ in range(2000)
-    ]
-    orders = [
-        (7, 9, 8),
-        (9, 8, 7),
-        (8, 7, 9),
-        (7, 8, 9),
-    ]  # in the last draw 7 and 8 are equal, and 7 has the higher mean
+    drawn = [order("thompson", DRAWS, ZERO, rng=rng) for _ in range(2000)]
+    orders = [(0, 2, 1), (2, 1, 0), (1, 0, 2), (0, 1, 2)]  # in the last draw 0 and 1 are equal; 0 has the higher mean
     assert set(drawn) == set(orders)
-    for order in orders:
-        assert abs(drawn.count(order) / 2000 - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 2000)
+    for expected in orders:
+        assert abs(drawn.count(expected) / 2000 - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 2000)
 
 
 def test_thompson_is_chosen_by_its_stream():
     rankings = [
-        [posterior_candidates("thompson", [7, 8, 9], DRAWS, ZERO, likelihood=None, rng=rng) for _ in range(20)]
+        [order("thompson", DRAWS, ZERO, rng=rng) for _ in range(20)]
         for rng in (np.random.default_rng(5), np.random.default_rng(5), np.random.default_rng(6))
     ]
     assert rankings[0] == rankings[1]
@@ -160,14 +174,13 @@ def test_information_prefers_what_the_posterior_is_unsure_of_over_what_the_exper
     # second is far better or far worse: its answer tells which.
     utilities = np.column_stack([np.zeros(100), np.repeat([-3.0, 3.0], 50)])
     for rule in ("information", "disagreement"):
-        order = posterior_candidates(rule, [0, 1], utilities + 1.0, np.ones(100), likelihood=Logistic(5.0), rng=None)
-        assert order == ((1, 0) if rule == "information" else (0, 1))  # to the order alone both are even matches
+        found = order(rule, utilities + 1.0, np.ones(100), likelihood=Logistic(5.0))
+        assert found == ((1, 0) if rule == "information" else (0, 1))  # to the order alone both are even matches
 
 
 @pytest.mark.parametrize(
     ("utilities", "incumbent", "message"),
     [
-        (DRAWS[:, :2], ZERO, "utilities: expected one for each of 3"),
         (DRAWS, np.zeros(3), r"utilities: expected draws of shapes \(S, n\) and \(S,\).*got \(4, 3\) and \(3,\)"),
         (DRAWS[0], ZERO, "utilities: expected draws"),
         (DRAWS[:0], ZERO[:0], "utilities: expected draws"),
@@ -177,9 +190,28 @@ def test_information_prefers_what_the_posterior_is_unsure_of_over_what_the_exper
 )
 def test_draws_that_do_not_fit_are_refused(utilities, incumbent, message):
     with pytest.raises(ValueError, match=message):
-        posterior_candidates("probably-better", [1, 2, 3], utilities, incumbent, **COIN)
+        probability_better(utilities, incumbent)
 
 
-def test_a_rule_there_is_not_is_refused():
-    with pytest.raises(ValueError, match=r"query: expected probably-better, .* got 'entropy'"):
-        posterior_candidates("entropy", [7, 8, 9], DRAWS, ZERO, **COIN)
+def test_without_a_sure_signal_information_is_asked_about_all_that_was_never_shown():
+    # trajectory 2 was shown; of the others only 1 is new
+    about = {"shown": (2,), "new": [1], "likelihood": Logistic(5.0)}
+    for signal, expected in ((None, (0,)), (0.74, (0,)), (0.75, (1,)), (1.0, (1,))):
+        given = situation(DRAWS * [9.0, 0.2, 0.2], ZERO, signal=signal, **about)
+        assert candidates(InformationWhenUnsure(), given) == expected
+
+
+def test_three_lines_make_a_rule_of_ones_own():
+    def newest(situation):
+        return sorted(situation.new, reverse=True)
+
+    assert candidates(newest, situation(DRAWS, ZERO)) == (2, 1, 0)
+
+
+@pytest.mark.parametrize("order_given", [[], None, [0, 0], [0, 4], [-1], [0.5], ["first"], 3])
+def test_an_order_that_is_none_is_named(order_given):
+    def careless(situation):
+        return order_given
+
+    with pytest.raises(ValueError, match="query rule careless: expected different trajectory numbers below 4, got"):
+        candidates(careless, situation(DRAWS, ZERO))

@@ -7,7 +7,7 @@ import pytest
 
 from bayespbrl import Learner, load, resume, start
 from bayespbrl.experts import ReturnExpert
-from bayespbrl.improvement.schedules import LEAST_BOUND, Bound, ConfidenceBound, ConstantBound, Situation, decided
+from bayespbrl.improvement.schedules import LEAST_BOUND, Bound, ConfidenceBound, ConstantBound, Situation, decide
 from bayespbrl.improvement.update import ProposedUpdate
 
 NUMBER = 400
@@ -15,9 +15,13 @@ NUMBER = 400
 
 def proposed(draws=None, seed=0):
     rng = np.random.default_rng(seed)
-    return ProposedUpdate(
-        rng.normal(size=NUMBER), rng.normal(size=(NUMBER, 3)), np.full(NUMBER, 1 / NUMBER), q_draws=draws
-    )
+    return update_of(rng.normal(size=NUMBER), rng.normal(size=(NUMBER, 3)), draws)
+
+
+def update_of(q_values, constraint, draws):
+    """A proposed update as far as a schedule looks at it."""
+    weights = np.full(len(q_values), 1 / len(q_values))
+    return ProposedUpdate(None, None, None, (), q_values, constraint, weights, draws)
 
 
 def situation(update, *, converged=True, usual=0.35):
@@ -44,21 +48,21 @@ def test_the_gain_of_the_smallest_updates_is_the_limit_of_the_others():
     direction, small = update.gains(), update.gains(1e-6)
     np.testing.assert_allclose(direction / direction[0], small / small[0], rtol=0.01)
     assert update.agreement() == update.agreement(1e-6)
-    signals = [ConfidenceBound()(situation(update, usual=usual)).statistics["signal"] for usual in (0.1, 1.0)]
+    signals = [ConfidenceBound()(situation(update, usual=usual)).signal for usual in (0.1, 1.0)]
     assert signals[0] == signals[1] == pytest.approx(np.mean(small) ** 2 / np.mean(small**2), rel=0.01)
 
 
 def test_a_q_that_is_constant_but_for_rounding_is_no_signal():
     values = 50 * (1 + 1e-10 * np.random.default_rng(1).normal(size=NUMBER))
-    features, base = np.random.default_rng(2).normal(size=(NUMBER, 3)), np.full(NUMBER, 1 / NUMBER)
+    features = np.random.default_rng(2).normal(size=(NUMBER, 3))
     for constraint in (features, np.arange(NUMBER) // 2):
-        update = ProposedUpdate(values, constraint, base, q_draws=np.outer(values, [0.5, 1.0, 2.0]))
+        update = update_of(values, constraint, np.outer(values, [0.5, 1.0, 2.0]))
         decision = ConfidenceBound()(situation(update))
-        assert (decision.kl_bound, decision.statistics["signal"]) == (LEAST_BOUND, 0.0)
+        assert (decision.kl_bound, decision.signal) == (LEAST_BOUND, 0.0)
 
 
 def test_features_of_the_constraint_that_are_not_finite_are_refused():
-    update = ProposedUpdate(np.arange(4.0), np.array([[0.0], [1.0], [np.nan], [2.0]]), np.full(4, 0.25), np.eye(4))
+    update = update_of(np.arange(4.0), np.array([[0.0], [1.0], [np.nan], [2.0]]), np.eye(4))
     for use in (lambda: update.solve(0.3), update.gains):
         with pytest.raises(ValueError, match="state_features: expected finite entries"):
             use()
@@ -68,14 +72,14 @@ def test_certain_draws_allow_the_largest_bound_and_draws_at_odds_the_least():
     mean = proposed().q_values
     sure = ConfidenceBound()(situation(proposed(np.column_stack([mean] * 10))))
     assert sure.kl_bound == pytest.approx(1.0)
-    assert (sure.statistics["signal"], sure.statistics["agreement"]) == (pytest.approx(1.0), 1.0)
+    assert (sure.signal, sure.statistics["agreement"]) == (pytest.approx(1.0), 1.0)
     assert ConfidenceBound(2.0)(situation(proposed(np.column_stack([mean] * 10)))).kl_bound == pytest.approx(2.0)
     at_odds = ConfidenceBound()(situation(proposed(np.column_stack([mean, -mean]))))
     assert (at_odds.kl_bound, at_odds.statistics["agreement"]) == (LEAST_BOUND, 0.5)
     assert "50% of the draws expect a gain" in at_odds.reason
     assert sure.statistics["rhat_max"] == 1.002
     worse = ConfidenceBound()(situation(proposed(np.column_stack([-mean] * 10))))
-    assert (worse.kl_bound, worse.statistics["signal"]) == (LEAST_BOUND, 0.0)
+    assert (worse.kl_bound, worse.signal) == (LEAST_BOUND, 0.0)
     nothing = ConfidenceBound()(situation(proposed(np.zeros((NUMBER, 4)))))
     assert nothing.kl_bound == LEAST_BOUND
 
@@ -87,8 +91,8 @@ def test_the_bound_is_the_square_of_the_length_that_weighs_gain_against_spread()
     gains = np.array([0.5, 1.0, 3.0, -1.0])
     lengths = np.linspace(0, 1, 100_001)
     worth = lengths * gains.mean() - 0.5 * lengths**2 * np.mean(gains**2) / gains.mean()
-    assert bound.statistics["signal"] == pytest.approx(lengths[np.argmax(worth)], abs=1e-5)
-    assert bound.kl_bound == pytest.approx(0.8 * bound.statistics["signal"] ** 2)
+    assert bound.signal == pytest.approx(lengths[np.argmax(worth)], abs=1e-5)
+    assert bound.kl_bound == pytest.approx(0.8 * bound.signal**2)
     assert bound.statistics["agreement"] == 0.75
 
 
@@ -114,24 +118,32 @@ def test_a_schedule_that_decides_nonsense_is_named(value):
         return value
 
     with pytest.raises(ValueError, match="schedule careless: expected a positive finite KL bound, got"):
-        decided(careless, situation(proposed()))
+        decide(careless, situation(proposed()))
 
 
-@pytest.mark.parametrize("statistics", [{"gain": np.ones(2)}, {"gain": {"mean": 1.0}}, {"reason": 1.0}, {1: 1.0}])
+@pytest.mark.parametrize(
+    "statistics", [{"gain": np.ones(2)}, {"gain": {"mean": 1.0}}, {"reason": 1.0}, {"signal": 1.0}, {1: 1.0}]
+)
 def test_statistics_that_could_not_be_kept_are_named(statistics):
     with pytest.raises(ValueError, match=r"schedule .*: expected statistics that are numbers by name, got"):
-        decided(lambda situation: Bound(0.2, "mine", statistics), situation(proposed()))
+        decide(lambda situation: Bound(0.2, "mine", None, statistics), situation(proposed()))
 
 
-@pytest.mark.parametrize("bound", [Bound(0.3, "x", None), Bound(0.3, {1, 2}, {}), Bound(0.3, None)])
+@pytest.mark.parametrize("signal", [-0.1, 1.5, float("nan"), "high", True])
+def test_a_signal_that_is_no_share_is_named(signal):
+    with pytest.raises(ValueError, match=r"schedule <lambda>, signal: expected a number in \[0, 1\], got"):
+        decide(lambda situation: Bound(0.2, "mine", signal), situation(proposed()))
+
+
+@pytest.mark.parametrize("bound", [Bound(0.3, "x", None, None), Bound(0.3, {1, 2}), Bound(0.3, None)])
 def test_a_reason_that_is_no_text_and_statistics_without_names_are_refused(bound):
     with pytest.raises(ValueError, match=r"schedule <lambda>: expected a reason in words and statistics by name, got"):
-        decided(lambda situation: bound, situation(proposed()))
+        decide(lambda situation: bound, situation(proposed()))
 
 
 def test_statistics_may_be_flags_texts_and_lists():
     statistics = {"sure": np.bool_(True), "why": "x", "gains": [1.0, np.float64(2.0)], "none": None}
-    assert decided(lambda situation: Bound(0.2, "mine", statistics), situation(proposed())).statistics == statistics
+    assert decide(lambda situation: Bound(0.2, "mine", 0.5, statistics), situation(proposed())).statistics == statistics
 
 
 @pytest.mark.parametrize("largest", [0.0, -1.0, float("nan"), float("inf")])
@@ -141,7 +153,7 @@ def test_bad_options_are_refused(largest):
 
 
 def three_lines(situation):
-    return Bound(0.2 if situation.iteration == 1 else 0.4, "by the clock", {"answers": float(situation.answers)})
+    return Bound(0.2 if situation.iteration == 1 else 0.4, "by the clock", None, {"answers": float(situation.answers)})
 
 
 def test_a_run_follows_a_schedule_of_the_users_own_records_why_and_goes_on_with_it(tmp_path):

@@ -1,13 +1,13 @@
 """Settings: every bad value is refused with its name, what was expected and what came."""
 
-import dataclasses
 import json
 
 import numpy as np
 import pytest
 
 from bayespbrl.envs import SHORT_NAMES
-from bayespbrl.settings import PRESETS, Settings, settings_for
+from bayespbrl.presets import PRESETS
+from bayespbrl.settings import OPTIONS, Settings, settings_for
 
 NAN, INFINITY = float("nan"), float("inf")
 BAD = {
@@ -52,7 +52,7 @@ BAD = {
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in BAD.items() for value in values])
 def test_a_bad_value_is_refused_with_name_expected_and_got(name, value):
     with pytest.raises(ValueError, match=rf"^{name}: expected .*, got ") as refusal:
-        Settings("gridworld", **{name: value})
+        Settings.from_options("gridworld", {name: value})
     assert repr(value)[:20] in str(refusal.value)
 
 
@@ -61,23 +61,25 @@ def test_a_bad_value_is_refused_with_name_expected_and_got(name, value):
 def test_a_query_rule_that_needs_a_posterior_is_refused_without_one(utility, query):
     message = f"^query: expected highest-utility with {utility}, no posterior, got '{query}'$"
     with pytest.raises(ValueError, match=message):
-        Settings("gridworld", utility=utility, query=query)
-    assert Settings("gridworld", utility=utility).query == "highest-utility"
-    assert Settings("gridworld", utility="posterior-draw", query=query).query == query
+        settings_for("gridworld", utility=utility, query=query)
+    assert settings_for("gridworld", utility=utility).questions.query == "highest-utility"
+    assert settings_for("gridworld", utility="posterior-draw", query=query).questions.query == query
 
 
 def test_every_option_is_checked():
-    assert {field.name for field in dataclasses.fields(Settings)} == {"env", *BAD}
+    assert set(OPTIONS) == set(BAD)
 
 
 def test_the_defaults_are_the_papers_protocol():
     settings = settings_for("gridworld")
-    assert (settings.iterations, settings.trajectories_per_iteration) == (25, 10)
-    assert Settings("any").discount == 0.98
-    assert settings.discount == 0.995  # the one departure, argued beside the preset
-    assert settings.psi_discount == 0.995
-    assert (settings.first_queries, settings.queries_per_iteration) == (2, 1)  # 26 answers in 25 iterations
-    assert (settings.utility, settings.likelihood, settings.evaluation_episodes) == ("posterior-mean", "mixed", 100)
+    assert (settings.iterations, settings.rollouts.trajectories_per_iteration) == (25, 10)
+    assert Settings("any").critic.discount == 0.98
+    assert settings.critic.discount == 0.995  # the one departure, argued beside the preset
+    assert settings.trajectory_discount == 0.995
+    questions = settings.questions  # 26 answers in 25 iterations
+    assert (questions.first_queries, questions.queries_per_iteration) == (2, 1)
+    assert (settings.estimation.utility, settings.model.likelihood) == ("posterior-mean", "mixed")
+    assert settings.rollouts.evaluation_episodes == 100
 
 
 def test_an_unknown_option_is_refused_by_name():
@@ -95,7 +97,7 @@ def test_changes_win_over_presets_and_none_changes_nothing():
 @pytest.mark.parametrize("env", PRESETS)
 def test_every_preset_is_valid_and_survives_json(env):
     settings = settings_for(env, seed=5)
-    assert Settings(**json.loads(json.dumps(dataclasses.asdict(settings)))) == settings
+    assert Settings.from_options(env, json.loads(json.dumps(settings.options()))) == settings
 
 
 @pytest.mark.parametrize(("short", "name"), SHORT_NAMES.items())
@@ -105,4 +107,11 @@ def test_a_preset_is_found_by_short_name_and_by_id(short, name):
 
 @pytest.mark.parametrize("value", [1e-6, 1, np.float64(0.3)])
 def test_whole_numbers_and_numpy_floats_are_numbers(value):
-    assert Settings("gridworld", kl_bound=value).kl_bound == value
+    assert settings_for("gridworld", kl_bound=value).update.kl_bound == value
+
+
+def test_each_option_is_read_by_one_part_and_every_part_keeps_its_own_defaults():
+    settings, given = Settings("any"), Settings.from_options("any", Settings("any").options())
+    assert settings == given
+    assert settings.own_parts == ()
+    assert settings_for("any", schedule="other", expert="other").own_parts == ("expert", "schedule")

@@ -9,10 +9,11 @@ import pytest
 import scipy.optimize
 
 from bayespbrl.features import OneHot
+from bayespbrl.models import PreferenceModel
 from bayespbrl.models.likelihoods import Logistic, Mixed, WithLapses, log_prob
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
-from bayespbrl.utility import estimate as utility
-from bayespbrl.utility.estimate import KnownReward, estimate_utility
+from bayespbrl.utility import KnownReward, inference
+from bayespbrl.utility.comparisons import Comparisons
 
 METHODS = ("posterior-mean", "most-likely", "posterior-draw", "linear-program")
 
@@ -25,6 +26,11 @@ def staying(state, steps=4, reward=0.0):
 TRAJECTORIES = [staying(0, reward=-1.0), staying(1, reward=0.5), staying(2, reward=2.0), staying(2, 2, reward=2.0)]
 PAIRS = [(1, 0), (2, 1)]
 ONE_HOT = OneHot(3)
+
+
+def estimate_utility(trajectories, pairs, features, *, method, discount=0.9, seed=0):
+    comparisons = Comparisons.among(trajectories, pairs, discount=discount)
+    return inference.estimate_utility(comparisons, features, PreferenceModel(), method=method, seed=seed)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -85,7 +91,7 @@ def test_a_pair_that_the_features_cannot_tell_apart_is_survived_and_counted_as_u
 
 def test_with_one_pair_the_posterior_mean_is_along_its_difference_and_matches_quadrature():
     # K = 1 leaves the sigmoid: w = z·d/|d| with density ∝ N(z; 0, 1) sigmoid(m |d| z), d scaled to (0, −1, 1).
-    estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-mean", discount=0.9, steepness=5.0)
+    estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-mean", discount=0.9)
     scale = np.sum(0.9 ** np.arange(4))
     z = np.linspace(-10, 10, 20001)
     density = np.exp(-0.5 * z**2) / (1 + np.exp(-5 * np.sqrt(2) * z))
@@ -125,7 +131,7 @@ def test_a_posterior_draw_is_a_draw_without_what_the_answers_do_not_touch():
 
 def test_posterior_draws_of_many_seeds_are_spread_as_the_posterior_is():
     estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-mean", discount=0.9)
-    drawn = [utility._weights(estimate.posterior, "posterior-draw", seed) for seed in range(400)]
+    drawn = [inference._weights(estimate.posterior, "posterior-draw", seed) for seed in range(400)]
     margins = np.array(drawn) @ [0, -1, 1] / estimate.scale
     draws = estimate.draws(np.array([[0.0, -1.0, 1.0]]))
     assert np.std(margins) == pytest.approx(draws.std(), rel=0.15)
@@ -139,7 +145,7 @@ def test_fewer_draws_are_some_of_all_evenly_spaced():
     np.testing.assert_array_equal(estimate.draws(np.eye(3), number=chains * length), every)
     np.testing.assert_allclose(estimate.draws(np.eye(3), number=100), every[:, :: length * chains // 100], rtol=1e-12)
     np.testing.assert_allclose(estimate.draws(np.eye(3), number=1), every[:, :1], rtol=1e-12)
-    with pytest.raises(ValueError, match="number: expected at least 1 draw, got 0"):
+    with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
         estimate.draws(np.eye(3), number=0)
 
 
@@ -179,10 +185,18 @@ def test_the_likelihood_takes_differences_of_utilities_as_they_are():
 
 def test_without_a_posterior_there_are_no_draws_and_no_likelihood():
     estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="linear-program", discount=0.9)
-    with pytest.raises(ValueError, match="draws: expected an estimate with a posterior"):
-        estimate.draws(np.eye(3))
+    assert estimate.sampled is None
     with pytest.raises(ValueError, match="likelihood: expected an estimate with a posterior"):
         _ = estimate.likelihood
+    one, other = TRAJECTORIES[:2]
+    for name, arguments in {
+        "trajectory_draws": ([one],),
+        "margin_draws": (one, other),
+        "state_draws": (np.arange(3),),
+        "utilities_and_draws": (np.arange(3),),
+    }.items():
+        with pytest.raises(ValueError, match=f"{name}: expected an estimate with a posterior, got Linear"):
+            getattr(estimate, name)(*arguments)
 
 
 def test_the_linear_program_reaches_the_optimum_that_scipy_finds():

@@ -10,9 +10,10 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from bayespbrl import Answer, Learner, ReturnExpert, queries, rollouts
-from bayespbrl import learner as cycle
+from bayespbrl import learner as learner_module
 from bayespbrl.envs.gridworld import REWARDS
-from bayespbrl.improvement import update as improvement
+from bayespbrl.improvement.schedules import Bound
+from bayespbrl.improvement.update import NEARLY
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
 
@@ -40,7 +41,8 @@ def remembered(**changes):
 
 def fingerprint(learner):
     """Everything that must come out the same, bit for bit."""
-    posterior = getattr(learner.estimate, "posterior", None)
+    sampled = None if learner.estimate is None else learner.estimate.sampled
+    posterior = None if sampled is None else sampled.posterior
     return {
         "summaries": [{k: v for k, v in s.items() if k != "seconds"} for s in learner.iterations],
         "policy": [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
@@ -178,25 +180,25 @@ def test_undoing_goes_back_over_iterations_that_asked_nothing():
 
 
 @pytest.mark.parametrize(
-    ("said", "converged", "asks"),
-    [
-        ({"signal": 0.5}, True, False),
-        ({"signal": 0.49}, True, True),
-        ({"signal": 0.9}, False, True),
-        ({"signal": None}, True, True),
-        ({"signal": "high"}, True, True),
-        ({}, False, False),
-    ],
+    ("signal", "converged", "asks"),
+    [(0.5, True, False), (0.49, True, True), (0.9, False, True), (None, True, False), (None, False, False)],
 )
-def test_what_the_schedule_said_decides_whether_to_ask(said, converged, asks):
+def test_what_the_schedule_said_decides_whether_to_ask(signal, converged, asks):
     run = learner(iterations=2, unasked_iterations=1)
     while run.state.iteration < 1:
         questions = run.ask()
         last = run.state
         run.tell([ReturnExpert()(*questions[0].trajectories)])
-    improved = run.state.summaries[0] | {"schedule": said, "utility_converged": converged}
+    quality = dataclasses.replace(run.estimate.quality, converged=converged)
     again = learner(iterations=2, unasked_iterations=1)
-    again.state = dataclasses.replace(run.state, summaries=(improved,), collected=False, iteration=1, unasked=0)
+    again.state = dataclasses.replace(
+        run.state,
+        estimate=dataclasses.replace(run.estimate, quality=quality),
+        bound=Bound(0.3, signal=signal),
+        collected=False,
+        iteration=1,
+        unasked=0,
+    )
     assert last.preferences.answers == 1
     assert bool(again.ask()) == asks
 
@@ -204,7 +206,7 @@ def test_what_the_schedule_said_decides_whether_to_ask(said, converged, asks):
 @pytest.mark.slow
 @pytest.mark.parametrize("threshold", [0.0, 0.5, 1.1])
 def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
-    monkeypatch.setattr(cycle, "UNASKED_SIGNAL", threshold)
+    monkeypatch.setattr(queries, "UNASKED_SIGNAL", threshold)
     options = {"utility": "posterior-mean", "schedule": "confidence", "unasked_iterations": 2, "iterations": 12}
     run = learner(**options).run(ReturnExpert())
     unasked = 0
@@ -423,7 +425,7 @@ def test_features_of_the_users_own_are_used():
         return np.column_stack([states == 4, states == 20]).astype(float)
 
     run = learner(features=corner, iterations=2).run(ReturnExpert())
-    assert run.settings.features == "other"
+    assert run.settings.features.features == "other"
     assert run.estimate.weights.shape == (2,)
 
 
@@ -441,7 +443,7 @@ def test_a_first_policy_of_the_users_own_is_where_learning_starts():
     right[:, 3] = 0.96
     run = learner(policy=TabularPolicy(right))
     run.ask()
-    assert run.settings.policy == "other"
+    assert run.settings.rollouts.policy == "other"
     assert np.mean(np.concatenate([t.actions for t in run.trajectories]) == 3) > 0.9
 
 
@@ -536,22 +538,22 @@ def compilations_after(run, iteration):
     return len(count)
 
 
-def seen_by_improve(monkeypatch, name):
-    """What step 2 is given as `name`, a value for each call from now on."""
-    seen, real = [], improvement.improve
+def seen_problems(monkeypatch):
+    """The problem of each update from now on."""
+    seen, real = [], learner_module.propose
 
-    def improve(*args, **options):
-        seen.append(options[name])
-        return real(*args, **options)
+    def propose(policy, problem, **options):
+        seen.append(problem)
+        return real(policy, problem, **options)
 
-    monkeypatch.setattr(improvement, "improve", improve)
+    monkeypatch.setattr(learner_module, "propose", propose)
     return seen
 
 
 def test_answers_have_a_discount_of_their_own(monkeypatch):
-    seen = seen_by_improve(monkeypatch, "discount")
+    seen = seen_problems(monkeypatch)
     run = learner(iterations=1, discount=0.9, trajectory_discount=1.0).run(ReturnExpert())
-    assert seen == [0.9]
+    assert [problem.critic.discount for problem in seen] == [0.9]
     trajectory = run.trajectories[3]
     whole = run.estimate.step_utilities(transitions([trajectory])).sum()
     np.testing.assert_allclose(run.estimate.trajectory_utilities([trajectory]), [whole], rtol=1e-12)
@@ -559,19 +561,20 @@ def test_answers_have_a_discount_of_their_own(monkeypatch):
 
 
 def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch):
-    seen = seen_by_improve(monkeypatch, "visited")
+    problems = seen_problems(monkeypatch)
     options = {"iterations": 3, "max_steps": 12, "centres": 20, "evaluation_episodes": 2, "utility": "linear-program"}
     run = Learner("swing-up", seed=3, update_states=150, recent_iterations=2, **options).run(ReturnExpert())
     acted = [{tuple(state) for state in trajectory.states[:-1]} for trajectory in run.trajectories]
+    seen = [problem.states for problem in problems]
     assert [len(states) for states in seen] == [120, 150, 150]
     recent = set().union(*acted[10:])  # of the two last iterations' 240
     assert {tuple(state) for state in seen[2]} < recent
     assert len(np.unique(seen[2], axis=0)) == 150
     again = Learner("swing-up", seed=3, update_states=150, recent_iterations=2, **options).run(ReturnExpert())
     assert fingerprint(again) == fingerprint(run)
-    seen.clear()
+    problems.clear()
     learner(iterations=1, update_states=150).run(ReturnExpert())
-    assert [states.shape for states in seen] == [(200,)]  # discrete ones are counted, so that all are taken
+    assert [problem.states.shape for problem in problems] == [(200,)]  # discrete: all
 
 
 @pytest.mark.slow
@@ -591,7 +594,7 @@ def test_the_bound_of_an_iteration_is_decided_once_and_followed_by_several_updat
     assert [summary["updates"] for summary in once.iterations] == [1, 1, 1]
     assert max(summary["updates"] for summary in often.iterations) > 1
     for summary in often.iterations:
-        assert summary["updates"] == 3 or summary["kl_fitted_policy"] >= improvement.NEARLY * 0.2
+        assert summary["updates"] == 3 or summary["kl_fitted_policy"] >= NEARLY * 0.2
     assert fingerprint(again) == fingerprint(often)
 
 
