@@ -1,9 +1,12 @@
+"""The command line: what it runs, what it shows, and what it refuses."""
+
+import contextlib
 import io
 import json
 import re
+import shutil
 import subprocess
 import sys
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -12,11 +15,12 @@ import xarray as xr
 
 import bayespbrl
 from bayespbrl.cli.commands import main
-from bayespbrl.cli.display import print_trials
+from bayespbrl.cli.display import show_trials
 from bayespbrl.experts import simulated_expert
-from bayespbrl.studies.trials import Trials
+from bayespbrl.studies import Trials
 
-QUICK = ["--utility", "linear-program", "--iterations", "2"]
+SHORT = ["--utility", "linear-program", "--max-steps", "10"]
+QUICK = [*SHORT, "--iterations", "2"]
 
 
 def call(monkeypatch, *arguments):
@@ -25,6 +29,15 @@ def call(monkeypatch, *arguments):
     with pytest.raises(SystemExit) as stop:
         main()
     return stop.value.code
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The directory of a run of two iterations, not to be changed, and what the command line showed of it."""
+    out = tmp_path_factory.mktemp("cli") / "run"
+    with pytest.MonkeyPatch.context() as monkeypatch, contextlib.redirect_stdout(io.StringIO()) as shown:
+        assert call(monkeypatch, "run", "gridworld", *QUICK, "--out", out) == 0
+    return out, shown.getvalue()
 
 
 def refused(monkeypatch, capsys, *arguments):
@@ -36,10 +49,15 @@ def refused(monkeypatch, capsys, *arguments):
     return error
 
 
-def test_run_leaves_a_run_directory_with_a_picture_and_says_where(monkeypatch, capsys, tmp_path):
-    out = tmp_path / "run"
-    assert call(monkeypatch, "run", "gridworld", *QUICK, "--out", out) == 0
-    shown = capsys.readouterr().out
+@pytest.fixture
+def unpictured(monkeypatch):
+    """Without the picture and the film of a finished run, which take most of the time of a short one."""
+    monkeypatch.setattr("bayespbrl.cli.display._film", lambda learner, directory: "")
+    monkeypatch.setattr("bayespbrl.diagnostics.plots.run_figure", lambda learner: mock.Mock())
+
+
+def test_run_leaves_a_run_directory_with_a_picture_and_says_where(finished):
+    out, shown = finished
     assert "answers" in shown
     assert re.sub(r"\s", "", str(out)) in re.sub(r"\s", "", shown)
     assert (out / "run.png").read_bytes().startswith(b"\x89PNG")
@@ -50,14 +68,14 @@ def test_run_leaves_a_run_directory_with_a_picture_and_says_where(monkeypatch, c
 
 def test_a_run_in_an_environment_that_cannot_be_rendered_finishes_and_says_so(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
-    options = ["--utility", "linear-program", "--iterations", "1", "--max-steps", "5", "--centres", "10"]
+    options = [*SHORT, "--iterations", "1", "--centres", "10"]
     with mock.patch.dict(sys.modules, {"pygame": None}):  # with which gymnasium renders it
         assert call(monkeypatch, "run", "CartPole-v1", *options, "--out", out) == 0
     assert "No film of the final policy: environment CartPole-v1 cannot be rendered" in capsys.readouterr().out
     assert not (out / "final.gif").exists()
 
 
-def test_trials_tell_redraws_and_how_long_the_final_policies_last(capsys):
+def test_trials_tell_redraws_and_how_long_the_final_policies_last(capsys, tmp_path):
     names = ["answers", "value", "bound_active", "kl", "kl_bound", "feature_gap", "feature_gap_raw", "rank_kept"]
     table = xr.Dataset(
         {name: (("seed", "iteration"), np.ones((2, 1))) for name in [*names, "utility_converged"]},
@@ -66,13 +84,15 @@ def test_trials_tell_redraws_and_how_long_the_final_policies_last(capsys):
     )
     table["terminated"] = ("seed", "iteration"), np.array([[0.0], [0.25]])
     table["balancing_steps"] = "seed", np.array([100.0, 300.0]), {"max_steps": 3000, "episodes": 100}
-    print_trials(Trials(table, Path("study")))
+    show_trials(Trials(table, tmp_path))
     shown = capsys.readouterr().out
-    assert "Redrawn for want of a preference: 2 trials, seeds 2, 4." in shown
+    assert "Trials redrawn because they met no preference: 2, seeds 2, 4." in shown
     assert "87.5% of the evaluation episodes survive (worst trial 75.0%)" in shown
-    assert "200 steps in the median trial, 100 in the worst, of 3000 at most" in shown
+    assert "200 steps in the median trial, 100 in the worst, at most 3000" in shown
+    assert (tmp_path / "trials.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_options_reach_the_settings(monkeypatch, tmp_path):
     out = tmp_path / "run"
     options = ["--kl-bound", "0.2", "--seed", "7", "--steepness", "3", "--wrong-answers", "0.1"]
@@ -84,31 +104,22 @@ def test_options_reach_the_settings(monkeypatch, tmp_path):
     assert {name: settings[name] for name in expected} == expected
 
 
-def test_rows_that_answers_do_not_tell_apart_have_their_iteration(monkeypatch, capsys, tmp_path):
-    options = [
-        "--utility",
-        "linear-program",
-        "--iterations",
-        "6",
-        "--unasked-iterations",
-        "5",
-        "--kl-bound",
-        "0.0734567",
-    ]
+@pytest.mark.usefixtures("unpictured")
+def test_rows_that_answers_do_not_tell_apart_have_their_iteration(monkeypatch, capsys, tmp_path, finished):
+    options = [*SHORT, "--iterations", "6", "--unasked-iterations", "5", "--kl-bound", "0.0734567"]
     assert call(monkeypatch, "run", "gridworld", *options, "--out", tmp_path / "quiet") == 0
     shown = capsys.readouterr().out
     rows = [[cell.strip() for cell in line.split("│")[1:3]] for line in shown.splitlines() if line.startswith("│")]
     assert rows == [["1", "2"], ["5", "4"], ["6", "4"]]
     assert "…" not in shown  # where eighty columns are too few, cells are cut
-    call(monkeypatch, "run", "gridworld", *QUICK, "--out", tmp_path / "asks")
-    assert "iteration ┃" not in capsys.readouterr().out
+    assert "iteration ┃" in shown
+    assert "answers ┃" in finished[1]
+    assert "iteration ┃" not in finished[1]
 
 
-def test_resuming_a_finished_run_says_so(monkeypatch, capsys, tmp_path):
-    out = tmp_path / "run"
-    call(monkeypatch, "run", "gridworld", *QUICK, "--out", out)
+def test_resuming_a_finished_run_says_so(monkeypatch, capsys, finished):
+    out = finished[0]
     before = (out / "events.jsonl").read_bytes()
-    capsys.readouterr()
     assert call(monkeypatch, "resume", out) == 0
     assert "finished" in capsys.readouterr().out
     assert (out / "events.jsonl").read_bytes() == before
@@ -116,7 +127,8 @@ def test_resuming_a_finished_run_says_so(monkeypatch, capsys, tmp_path):
 
 def test_resuming_draws_the_pictures_that_a_finished_run_lacks(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
-    bayespbrl.start("gridworld", out, utility="linear-program", iterations=2, expert="other").run(simulated_expert())
+    options = {"utility": "linear-program", "iterations": 1, "max_steps": 10, "expert": "other"}
+    bayespbrl.start("gridworld", out, **options).run(simulated_expert())
     before = (out / "events.jsonl").read_bytes()
     assert call(monkeypatch, "resume", out) == 0
     shown = capsys.readouterr().out
@@ -137,19 +149,22 @@ def test_nobody_answers_for_an_expert_of_the_users_own(monkeypatch, capsys, tmp_
     assert (tmp_path / "own" / "events.jsonl").read_bytes() == before
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_a_path_with_square_brackets_is_shown_as_it_is(monkeypatch, capsys, tmp_path):
     out = tmp_path / "[wide]" / "[/b]"
-    assert call(monkeypatch, "run", "gridworld", "--utility", "linear-program", "--iterations", "1", "--out", out) == 0
+    assert call(monkeypatch, "run", "gridworld", *SHORT, "--iterations", "1", "--out", out) == 0
     assert f"Run directory: {out}" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_a_run_without_out_gets_a_fresh_directory_under_runs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
-        assert call(monkeypatch, "run", "gridworld", *QUICK) == 0
+        assert call(monkeypatch, "run", "gridworld", *SHORT, "--iterations", "1") == 0
     assert len(list((tmp_path / "runs").iterdir())) == 2
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_a_person_answers_at_the_prompt_stops_and_resumes(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     monkeypatch.setattr(sys, "stdin", io.StringIO("1\nx\nt\nq\n"))
@@ -199,10 +214,8 @@ def test_a_foreign_directory_cannot_be_resumed(monkeypatch, capsys, tmp_path):
     assert "settings.json" in refused(monkeypatch, capsys, "resume", tmp_path)
 
 
-def test_a_truncated_iteration_file_is_named(monkeypatch, capsys, tmp_path):
-    out = tmp_path / "run"
-    call(monkeypatch, "run", "gridworld", *QUICK, "--out", out)
-    capsys.readouterr()
+def test_a_truncated_iteration_file_is_named(monkeypatch, capsys, tmp_path, finished):
+    out = shutil.copytree(finished[0], tmp_path / "run")
     file = out / "iterations" / "0002.nc"
     file.write_bytes(file.read_bytes()[:1000])
     assert "0002.nc" in refused(monkeypatch, capsys, "resume", out)

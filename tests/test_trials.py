@@ -1,3 +1,6 @@
+"""Studies: the trials of a study, its tables, what is kept and redrawn, and that its processes end with it."""
+
+import contextlib
 import csv
 import json
 import os
@@ -6,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,16 +20,38 @@ import xarray as xr
 
 from bayespbrl import load, runs
 from bayespbrl.rollouts import returns
+from bayespbrl.studies import Trials, run_trials
 from bayespbrl.studies import trials as trials_module
 from bayespbrl.studies.tables import COLUMNS, collect
-from bayespbrl.studies.trials import Trials, run_trials
 
-QUICK = {"utility": "linear-program", "iterations": 2}
+QUICK = {"utility": "linear-program", "iterations": 2, "max_steps": 20, "evaluation_episodes": 5}
+
+
+class ThisProcess:
+    """A pool without processes, which take most of the time of a short trial."""
+
+    def submit(self, function, *arguments):
+        future = Future()
+        try:
+            future.set_result(function(*arguments))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def without_processes(monkeypatch):
+    monkeypatch.setattr(trials_module, "trial_processes", lambda jobs: contextlib.nullcontext(ThisProcess()))
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    without_processes(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
-    return run_trials("gridworld", tmp_path_factory.mktemp("study"), trials=2, jobs=2, seed=5, **QUICK)
+    """Of two trials in processes of their own."""
+    return run_trials("gridworld", tmp_path_factory.mktemp("study"), seeds=range(5, 7), jobs=2, **QUICK)
 
 
 def test_every_trial_is_a_run_that_load_reads(study):
@@ -105,6 +131,7 @@ def test_a_trial_in_a_process_of_its_own_is_the_run_of_its_seed(study, tmp_path)
     assert [entry["value"] for entry in learner.iterations] == pytest.approx([entry["value"] for entry in kept])
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_second_call_keeps_finished_trials_and_goes_on_with_unfinished_ones(study):
     finished, stopped = study.path / "seed-5", study.path / "seed-6"
     before = {file: file.stat().st_mtime_ns for file in finished.rglob("*") if file.is_file()}
@@ -112,25 +139,28 @@ def test_a_second_call_keeps_finished_trials_and_goes_on_with_unfinished_ones(st
     events = (stopped / "events.jsonl").read_text().splitlines(keepends=True)
     (stopped / "events.jsonl").write_text("".join(events[:4]))  # as if killed after the second question
     (stopped / "summary.json").unlink()
-    shutil.rmtree(study.path / "trials.nc", ignore_errors=True)
-    again = run_trials("gridworld", study.path, trials=2, jobs=1, seed=5, **QUICK)
+    (study.path / "trials.nc").unlink()
+    again = run_trials("gridworld", study.path, seeds=range(5, 7), **QUICK)
+    assert (study.path / "trials.nc").exists()
     assert {file: file.stat().st_mtime_ns for file in finished.rglob("*") if file.is_file()} == before
     np.testing.assert_array_equal(again.table["value"].values, values)
 
 
 def test_a_directory_with_other_settings_is_refused(study):
     with pytest.raises(ValueError, match="expected a trial with these settings"):
-        run_trials("gridworld", study.path, trials=2, seed=5, **(QUICK | {"iterations": 3}))
+        run_trials("gridworld", study.path, seeds=range(5, 7), **(QUICK | {"iterations": 3}))
 
 
 # A single step from the centre of the grid often brings three times the same reward: in seeds 6 and 7 the first answers
 # are both ties, in 5, 8 and 9 they are not.
-TIED = QUICK | {"max_steps": 1, "evaluation_episodes": 2, "seed": 5, "preference_within": 1}
+TIED = QUICK | {"max_steps": 1, "evaluation_episodes": 2, "preference_within": 1}
 
 
 @pytest.fixture(scope="module")
 def redrawn(tmp_path_factory):
-    return run_trials("gridworld", tmp_path_factory.mktemp("redrawn"), trials=3, jobs=2, **TIED)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        without_processes(monkeypatch)
+        return run_trials("gridworld", tmp_path_factory.mktemp("redrawn"), seeds=range(5, 8), **TIED)
 
 
 def test_a_trial_that_meets_no_preference_is_left_and_the_next_unused_seed_takes_its_place(redrawn):
@@ -148,12 +178,13 @@ def test_a_trial_that_meets_no_preference_is_left_and_the_next_unused_seed_takes
         assert {row["seed"] for row in csv.DictReader(file)} == {"5", "8", "9"}
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_second_call_redraws_nothing_again_and_a_lost_trial_comes_back(redrawn):
     before = {file: file.stat().st_mtime_ns for file in redrawn.path.rglob("seed-[5679]/**/*") if file.is_file()}
     values = redrawn.table["value"].values
     shutil.rmtree(redrawn.path / "seed-8")
     finished = []
-    again = run_trials("gridworld", redrawn.path, trials=3, progress=finished.append, **TIED)
+    again = run_trials("gridworld", redrawn.path, seeds=range(5, 8), progress=finished.append, **TIED)
     assert sorted(finished) == [5, 8, 9]  # two of them from before
     assert {file: file.stat().st_mtime_ns for file in before} == before
     np.testing.assert_array_equal(again.table["value"].values, values)
@@ -171,10 +202,21 @@ def test_the_seeds_of_a_study_do_not_depend_on_which_trial_ends_first(order):
     assert seeds.with_outcome(False) == [11, 12, 13]
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_study_that_hardly_ever_meets_a_preference_gives_up(tmp_path, monkeypatch):
     monkeypatch.setattr(trials_module, "MOST_SEEDS_A_TRIAL", 2)
     with pytest.raises(ValueError, match="2 of 2 trials met no preference within 1 iterations: expected 1 that do"):
-        run_trials("gridworld", tmp_path, trials=1, **(TIED | {"seed": 6}))
+        run_trials("gridworld", tmp_path, seeds=range(6, 7), **TIED)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_trial_that_fails_is_named_by_its_seed_and_the_others_are_finished(study, tmp_path):
+    shutil.copytree(study.path / "seed-5", tmp_path / "seed-5")
+    (tmp_path / "seed-5" / "summary.json").unlink()
+    (tmp_path / "seed-5" / "iterations" / "0001.nc").write_text("hello")
+    with pytest.raises(ValueError, match=r"1 of 2 trials failed; the first: seed 5: .*0001\.nc: expected the netCDF"):
+        run_trials("gridworld", tmp_path, seeds=range(5, 7), **QUICK)
+    assert load(tmp_path / "seed-6").learner.finished
 
 
 def test_only_the_acrobot_needs_a_preference_and_within_three_iterations(tmp_path, monkeypatch):
@@ -182,14 +224,15 @@ def test_only_the_acrobot_needs_a_preference_and_within_three_iterations(tmp_pat
     monkeypatch.setattr(trials_module, "_in_parallel", lambda seeds, jobs, progress: seen.append(seeds.study))
     for env in ("acrobot", "bayespbrl/Acrobot-v0", "gridworld", "CartPole-v1"):
         with pytest.raises(IndexError):  # no run has left a summary
-            run_trials(env, tmp_path, trials=1)
+            run_trials(env, tmp_path, seeds=range(1000, 1001))
     assert [study.preference_within for study in seen] == [3, 3, None, None]
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("in_this_process")
 def test_bicycle_trials_tell_survival_and_balancing_time(tmp_path):
-    options = {"utility": "linear-program", "iterations": 2, "centres": 20, "evaluation_episodes": 10, "seed": 1}
-    study = run_trials("bicycle", tmp_path, trials=1, policy="linear-gaussian", **options)
+    options = {"utility": "linear-program", "iterations": 2, "centres": 20, "evaluation_episodes": 10}
+    study = run_trials("bicycle", tmp_path, seeds=range(1, 2), policy="linear-gaussian", **options)
     run = load(tmp_path / "seed-1")
     last = returns("bicycle", run.learner.policy, key=jax.random.key(1), episodes=100, max_steps=3000)
     steps = study.table["balancing_steps"]
@@ -202,16 +245,20 @@ def test_bicycle_trials_tell_survival_and_balancing_time(tmp_path):
     assert float(second["balancing_seconds"]) == pytest.approx(0.01 * last.steps.mean())
     assert (first["balancing_steps"], first["balancing_seconds"]) == ("", "")
     (tmp_path / "seed-1" / "balancing.json").unlink()  # as if killed before it was measured
-    again = run_trials("bicycle", tmp_path, trials=1, policy="linear-gaussian", **options)
+    again = run_trials("bicycle", tmp_path, seeds=range(1, 2), policy="linear-gaussian", **options)
     np.testing.assert_array_equal(again.table["balancing_steps"], steps)
 
 
 @pytest.mark.parametrize(
-    "changes", [{"trials": 0}, {"jobs": 0}, {"preference_within": 0}, {"expert": "terminal"}, {"kl_bound": -1.0}]
+    "changes",
+    [
+        *({"seeds": seeds} for seeds in (range(5, 5), range(0, 8, 2), [5, 6], 5)),
+        *({"jobs": 0}, {"preference_within": 0}, {"expert": "terminal"}, {"kl_bound": -1.0}),
+    ],
 )
 def test_bad_input_is_named_and_nothing_is_left(tmp_path, changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
-        run_trials("gridworld", tmp_path / "study", **({"trials": 1} | changes))
+        run_trials("gridworld", tmp_path / "study", **({"seeds": range(1000, 1001)} | changes))
     assert not (tmp_path / "study").exists()
 
 

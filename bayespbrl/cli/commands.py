@@ -8,7 +8,10 @@ from typing import Annotated, TypedDict, Unpack, get_type_hints
 
 import typer
 
-from bayespbrl.cli.display import PICTURE, console, draw_trials, print_trials, progress_bar, run_to_the_end, show_run
+from bayespbrl import checks, runs
+from bayespbrl.cli.display import PICTURE, console, progress_bar, run_to_the_end, show_run, show_trials
+from bayespbrl.runs.directory import fresh_directory
+from bayespbrl.studies import run_trials
 
 app = typer.Typer(
     help="Preference-based reinforcement learning: a policy from answers to 'which of these two is better?'.",
@@ -21,61 +24,74 @@ Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot,
 
 
 class RunOptions(TypedDict, total=False):
-    """Of a run, and of each trial; where one is left out the preset of the environment decides."""
+    """Options of a run and of each trial. An option left out has the value of the environment's preset."""
 
     utility: Annotated[
         str | None,
-        typer.Option(help="posterior-mean, most-likely, posterior-draw, linear-program or known-reward (the ceiling)."),
+        typer.Option(
+            help="Estimate of the utility: posterior-mean, most-likely, posterior-draw, linear-program, or "
+            "known-reward (a reference run trained on the hidden reward)."
+        ),
     ]
     query: Annotated[
         str | None,
         typer.Option(
-            help="highest-utility (the paper's), probably-better, thompson, information, disagreement or "
-            "information-when-unsure."
+            help="Rule that selects the trajectories to ask about: highest-utility (the paper's), probably-better, "
+            "thompson, information, disagreement or information-when-unsure."
         ),
     ]
     schedule: Annotated[
         str | None,
-        typer.Option(help="constant (the paper's), or confidence: the bound follows the posterior's certainty."),
+        typer.Option(
+            help="KL bound of each update: constant (the paper's), or confidence, which scales it with the posterior's "
+            "confidence that the update is an improvement."
+        ),
     ]
     hyperparameters: Annotated[
         str | None,
         typer.Option(
-            help="evidence: length scales, steepness and lapse rate by the answers; averaged over the first two; or "
-            "given."
+            help="Length scales, steepness and lapse rate: evidence (by marginal likelihood), averaged (over length "
+            "scales and steepness, weighted by marginal likelihood) or given (as set)."
         ),
     ]
-    iterations: Annotated[int | None, typer.Option(help="Cycles of the four steps.")]
-    kl_bound: Annotated[float | None, typer.Option(help="Bound on each policy update, in nats.")]
+    iterations: Annotated[int | None, typer.Option(help="Number of cycles of the four steps.")]
+    kl_bound: Annotated[float | None, typer.Option(help="KL bound of each policy update, in nats.")]
     updates_per_iteration: Annotated[
-        int | None, typer.Option(help="Policy updates from the same trajectories and answers; the paper's is 1.")
+        int | None, typer.Option(help="Maximum number of policy updates per iteration; the paper's is 1.")
     ]
     unasked_iterations: Annotated[
         int | None,
         typer.Option(
-            help="Iterations in a row, at most, that ask nothing, and no more than half the answers so far: with the "
-            "schedule confidence while it is sure, with constant always; 0 is the paper's."
+            help="Maximum number of consecutive iterations without a question (at most half the answers so far); with "
+            "the schedule confidence only while its confidence is high; the paper's is 0."
         ),
     ]
-    likelihood: Annotated[str | None, typer.Option(help="mixed (eq. 8), logistic or probit.")]
-    prior_scale: Annotated[float | None, typer.Option(help="Prior standard deviation of a utility weight.")]
-    steepness: Annotated[float | None, typer.Option(help="Of the likelihood, in units of the largest difference.")]
-    lapse_rate: Annotated[float | None, typer.Option(help="Share of answers that the model takes for coin tosses.")]
-    discount: Annotated[
-        float | None, typer.Option(help="Of Q, and of ψ(τ) unless told, in [0, 1); the paper's is 0.98.")
+    likelihood: Annotated[str | None, typer.Option(help="Likelihood of an answer: mixed (eq. 8), logistic or probit.")]
+    prior_scale: Annotated[float | None, typer.Option(help="Prior standard deviation of each utility weight.")]
+    steepness: Annotated[
+        float | None, typer.Option(help="Steepness of the likelihood, for feature differences scaled to at most 1.")
     ]
+    lapse_rate: Annotated[float | None, typer.Option(help="Share of answers modelled as coin tosses, in [0, 1).")]
+    discount: Annotated[float | None, typer.Option(help="Discount of Q, in [0, 1); the paper's is 0.98.")]
     trajectory_discount: Annotated[
-        float | None, typer.Option(help="Of ψ(τ), by which answers are explained, in [0, 1]; the paper's is that of Q.")
+        float | None,
+        typer.Option(help="Discount of the trajectory features, in [0, 1]; the paper's is that of Q."),
     ]
-    wrong_answers: Annotated[float | None, typer.Option(help="Share of the simulated expert's answers turned round.")]
-    policy: Annotated[str | None, typer.Option(help="auto, tabular, softmax, linear-gaussian or gaussian-process.")]
-    centres: Annotated[int | None, typer.Option(help="Radial basis functions of each kind of feature.")]
-    max_steps: Annotated[int | None, typer.Option(help="Steps an episode, in place of the environment's own limit.")]
-    expert: Annotated[str | None, typer.Option(help="return (simulated) or terminal (you).")]
+    wrong_answers: Annotated[
+        float | None, typer.Option(help="Share of the simulated expert's answers that are reversed, in [0, 1].")
+    ]
+    policy: Annotated[
+        str | None, typer.Option(help="Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.")
+    ]
+    centres: Annotated[int | None, typer.Option(help="Number of radial basis functions of each kind of feature.")]
+    max_steps: Annotated[
+        int | None, typer.Option(help="Maximum steps per episode; the environment's limit if omitted.")
+    ]
+    expert: Annotated[str | None, typer.Option(help="Who answers: return (simulated) or terminal (you).")]
 
 
 def _takes_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """`command` with its `**options` spelled out one by one, as Typer wants them."""
+    """`command` with a parameter for each of its `**options`, as Typer requires."""
     parameters = inspect.signature(command).parameters.values()
     named = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
     options = [
@@ -91,38 +107,35 @@ def _takes_run_options(command: Callable[..., None]) -> Callable[..., None]:
 def run(
     env: Env,
     *,
-    seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="Run directory; a fresh one under runs/ when left out.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Run directory; a new one under runs/ if omitted.")] = None,
     **options: Unpack[RunOptions],
 ) -> None:
-    """Learn a task from preferences and keep the run in a directory."""
-    from bayespbrl import runs
-
-    _expect_an_expert(options.get("expert"))
-    run_to_the_end(runs.start(env, out, seed=seed, **options))
+    """Learn a task from preferences; the run is kept in a directory."""
+    _check_expert(options.get("expert"))
+    directory = out or fresh_directory(env)
+    run_to_the_end(runs.start(env, directory, seed=seed, **options), directory)
 
 
 @app.command()
-def resume(directory: Annotated[Path, typer.Argument(help="Directory of a run that was stopped.")]) -> None:
-    """Go on with a run where it stopped; no answer is asked for twice."""
-    from bayespbrl import runs
-
+def resume(directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")]) -> None:
+    """Continue an interrupted run; no answer is asked for twice."""
     learner = runs.resume(directory)
     if not learner.finished:
-        _expect_an_expert(learner.settings.expert)
-        run_to_the_end(learner)
-    elif not (directory / PICTURE).exists():  # stopped while it was drawn, or run in Python
-        show_run(learner)
+        _check_expert(learner.settings.expert)
+        run_to_the_end(learner, directory)
+    elif not (directory / PICTURE).exists():  # interrupted before it was drawn, or run in Python
+        show_run(learner, directory)
     else:
-        console.print(f"{directory}: this run is finished; nothing is left to do.")
+        console.print(f"{directory}: this run is finished; there is nothing left to do.")
 
 
 @app.command()
 def report(
-    directory: Annotated[Path, typer.Argument(help="Directory of a run: finished, in progress or broken.")],
-    format: Annotated[str, typer.Option(help="html (one file) or md (pictures beside it).")] = "html",
+    directory: Annotated[Path, typer.Argument(help="Directory of a run: finished, in progress or damaged.")],
+    format: Annotated[str, typer.Option(help="html (one file) or md (with a folder of pictures).")] = "html",
 ) -> None:
-    """Write a diagnostic report of a run into its directory."""
+    """Write the diagnostic report of a run into its directory."""
     from bayespbrl.diagnostics.report import write_report
 
     console.print(f"Report: {write_report(directory, format=format)}")
@@ -133,37 +146,34 @@ def report(
 def trials(
     env: Env,
     *,
-    number: Annotated[int, typer.Option("--trials", help="How many seeds.")] = 20,
-    jobs: Annotated[int, typer.Option(help="Trials at a time, each in a process of its own.")] = 1,
-    seed: Annotated[int, typer.Option(help="The first seed.")] = 1000,
-    out: Annotated[Path | None, typer.Option(help="Directory of the study; under runs/ when left out.")] = None,
+    number: Annotated[int, typer.Option("--trials", help="Number of trials, one per seed.")] = 20,
+    jobs: Annotated[int, typer.Option(help="Number of trials at a time, each in its own process.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the first trial.")] = 1000,
+    out: Annotated[Path | None, typer.Option(help="Directory of the study; under runs/ if omitted.")] = None,
     **options: Unpack[RunOptions],
 ) -> None:
-    """Run many seeds side by side and print median and quartiles; a second call does only what is missing."""
-    from bayespbrl.studies.trials import run_trials
-
+    """Run many seeds and print median and quartiles of the value; finished trials are not repeated."""
+    checks.whole("trials", number)
     utility = options.get("utility") or "posterior-mean"
     directory = out or Path("runs") / f"trials-{env.replace('/', '-').lower()}-{utility}"
     with progress_bar() as bar:
         task = bar.add_task("trials", total=number, state=f"{directory}")
         try:
-            study = run_trials(
-                env, directory, trials=number, jobs=jobs, seed=seed, progress=lambda _: bar.advance(task), **options
-            )
+            seeds = range(seed, seed + number)
+            study = run_trials(env, directory, seeds=seeds, jobs=jobs, progress=lambda _: bar.advance(task), **options)
         except KeyboardInterrupt:
-            console.print("Stopped. Nothing is lost: the same command goes on.")
+            console.print("Stopped. Nothing is lost: repeat the command to continue.")
             raise
         bar.update(task, completed=number)
-    print_trials(study)
-    draw_trials(study)
+    show_trials(study)
 
 
 def main() -> None:
-    """Entry point: bad input is one line on standard error and exit status 2."""
+    """Entry point. Bad input gives one line on standard error and exit status 2."""
     try:
         status = app(standalone_mode=False)
     except (ValueError, OSError) as error:
-        status = _complain(str(error))
+        status = _print_error(str(error))
     except (KeyboardInterrupt, typer.Abort):
         status = 130
     except typer.Exit as stop:
@@ -171,20 +181,16 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # Typer's usage errors, whose common class it does not export
             raise
-        status = _complain(error.format_message())
+        status = _print_error(error.format_message())
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _expect_an_expert(name: str | None) -> None:
-    """Nobody answers here for an expert of the user's own.
-
-    Raises:
-      ValueError: it is such a run.
-    """
+def _check_expert(name: str | None) -> None:
+    """Refuse a run with an expert of the user's own, who cannot answer on the command line."""
     if name == "other":
-        raise ValueError("expert: expected return or terminal, got other: such a run goes on in Python, Learner.run")
+        raise ValueError("expert: expected return or terminal, got other; continue in Python with Learner.run")
 
 
-def _complain(message: str) -> int:
+def _print_error(message: str) -> int:
     print(f"bayespbrl: {' '.join(message.split())}", file=sys.stderr)
     return 2

@@ -1,48 +1,50 @@
-"""What the command line shows: the bar of a run, its tables and pictures, and a person's questions."""
+"""What the command line shows: progress, tables and pictures of runs and studies, and questions to a person."""
 
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+import xarray as xr
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bayespbrl.envs.opening import environment_attribute
+from bayespbrl.envs.opening import environment_attribute, open_environment
+from bayespbrl.experts import TerminalExpert, simulated_expert
+from bayespbrl.learner import Learner
+from bayespbrl.runs.film import film_policy
+from bayespbrl.studies import Trials
+from bayespbrl.trajectories import Trajectory
 
-console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may hold square brackets
+console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may contain square brackets
 PICTURE = "run.png"
 
 
-def run_to_the_end(learner: Any) -> None:
-    """Run a logged learner to its end, showing how it goes, and say where everything is."""
-    directory = learner.log.path
+def run_to_the_end(learner: Learner, directory: Path) -> None:
+    """Run a learner that keeps its events in `directory` to its end, with its progress, then `show_run`."""
     console.print(f"Run directory: {directory}")
     try:
         if learner.settings.expert == "terminal":
-            learner.run(_person(learner, directory), progress=_say)
+            learner.run(_person(learner, directory), progress=lambda now: console.print(_state(now)))
         else:
             _run_with_bar(learner)
     except KeyboardInterrupt:
         console.print(f"\nStopped. Nothing is lost: bayespbrl resume {directory}")
         raise
-    show_run(learner)
+    show_run(learner, directory)
 
 
-def show_run(learner: Any) -> None:
-    """The iterations of a logged learner, its film and its picture: where that is, all is."""
+def show_run(learner: Learner, directory: Path) -> None:
+    """Print the iterations of a run, draw its picture and film into `directory`, and print their paths."""
     from bayespbrl.diagnostics.plots import run_figure
 
-    directory = learner.log.path
     _print_iterations(learner)
     film, picture = _film(learner, directory), directory / PICTURE
     run_figure(learner).savefig(picture, dpi=110)
     console.print(f"Run directory: {directory}\nPicture: {picture}\n{film}")
 
 
-def _film(learner: Any, directory: Path) -> str:
-    """Film the final policy, and say where or why not: not every environment can be rendered."""
-    from bayespbrl.runs.film import film_policy
-
+def _film(learner: Learner, directory: Path) -> str:
+    """Film the final policy; returns a line with the paths, or why there is no film."""
     try:
         film, strip = film_policy(learner, directory)
     except ValueError as error:
@@ -50,10 +52,8 @@ def _film(learner: Any, directory: Path) -> str:
     return f"Final policy: {film} and {strip}"
 
 
-def _run_with_bar(learner: Any) -> None:
-    from bayespbrl.experts import simulated_expert
-
-    console.print("The simulated expert answers, by the hidden reward.")
+def _run_with_bar(learner: Learner) -> None:
+    console.print("The simulated expert answers according to the hidden reward.")
     with progress_bar() as bar:
         total, done = learner.settings.iterations, learner.state.iteration
         task = bar.add_task("iterations", total=total, completed=done, state=_state(learner))
@@ -65,14 +65,14 @@ def _run_with_bar(learner: Any) -> None:
 
 
 def progress_bar() -> Progress:
-    """Of so many done of so many, with the task's field `state` behind it."""
+    """A bar with the number of steps done and the task's field `state` after it."""
     done = TextColumn("{task.description} {task.completed}/{task.total}")
     return Progress(
         done, BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[state]}", markup=False), console=console
     )
 
 
-def _state(learner: Any) -> str:
+def _state(learner: Learner) -> str:
     text = f"answers {learner.preferences.answers}"
     if learner.iterations:
         last = learner.iterations[-1]
@@ -80,21 +80,14 @@ def _state(learner: Any) -> str:
     return text
 
 
-def _say(learner: Any) -> None:
-    console.print(_state(learner))
-
-
-def _person(learner: Any, directory: Path) -> Any:
-    """The person at this terminal, who sees pictures of the two trajectories."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def _person(learner: Learner, directory: Path) -> TerminalExpert:
+    """The person at this terminal, who looks at a picture of the two trajectories."""
     from matplotlib.figure import Figure
 
     from bayespbrl.envs.pictures import draw_trajectory
-    from bayespbrl.experts import TerminalExpert
 
-    def draw(first: Any, second: Any, path: Path) -> None:
+    def draw(first: Trajectory, second: Trajectory, path: Path) -> None:
         figure = Figure(figsize=(11, 5), layout="constrained")
-        FigureCanvasAgg(figure)
         for axes, trajectory, name in zip(figure.subplots(1, 2), (first, second), ("first", "second"), strict=True):
             draw_trajectory(learner.environment, trajectory, axes)
             axes.set_title(f"{name}: {axes.get_title()}")
@@ -116,13 +109,14 @@ def _table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     console.print(table)
 
 
-def _print_iterations(learner: Any) -> None:
+def _print_iterations(learner: Learner) -> None:
     """A row for the first iteration, every fifth and the last, narrow enough for eighty columns."""
     optimum = environment_attribute(learner.environment, "optimal_return")
-    quiet = len({s["answers"] for s in learner.iterations}) < len(learner.iterations)  # answers do not tell them apart
+    # the number of answers does not identify an iteration where some ask nothing
+    numbered = len({s["answers"] for s in learner.iterations}) < len(learner.iterations)
     rows = [
         [
-            *([str(s["iteration"])] if quiet else []),
+            *([str(s["iteration"])] if numbered else []),
             str(s["answers"]),
             f"{s['value']:.2f}",
             *([] if optimum is None else [f"{s['value'] / optimum:.1%}"]),
@@ -135,16 +129,33 @@ def _print_iterations(learner: Any) -> None:
         if s["iteration"] % 5 == 0 or s["iteration"] in (1, len(learner.iterations))
     ]
     share = [] if optimum is None else ["optimum"]
-    columns = ["iteration"] * quiet + ["answers", "value", *share, "pairs", "KL/bound", "R̂", "draws"]
-    _table(f"{learner.settings.env}, {learner.settings.utility}, seed {learner.settings.seed}", columns, rows)
+    columns = ["iteration"] * numbered + ["answers", "value", *share, "pairs", "KL/bound", "R̂", "draws"]
+    _table(
+        f"{learner.settings.env}, {learner.settings.estimation.utility}, seed {learner.settings.seed}", columns, rows
+    )
 
 
-def print_trials(study: Any) -> None:
-    """Median and quartiles by number of answers, and how honest the numerics were."""
-    from bayespbrl.rollouts import open_environment
+def show_trials(study: Trials) -> None:
+    """Print the results of a study, draw its learning curves beside its tables, and print their paths."""
+    from bayespbrl.diagnostics.plots import trials_figure
 
     table, quartiles = study.table, study.quartiles()
-    optimum = environment_attribute(open_environment(table.attrs["env"]), "optimal_return")
+    environment = open_environment(table.attrs["env"])
+    title = f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials"
+    _print_quartiles(quartiles, environment_attribute(environment, "optimal_return"), title)
+    if table.attrs["redraws"]:
+        seeds = table.attrs["redrawn_seeds"].replace(" ", ", ")
+        console.print(f"Trials redrawn because they met no preference: {table.attrs['redraws']}, seeds {seeds}.")
+    if "balancing_steps" in table:
+        _print_balancing(1 - table["terminated"].isel(iteration=-1), table["balancing_steps"])
+    _print_numerics(table)
+    console.print(f"Tables: {study.path / 'trials.csv'}, {study.path / 'trials.nc'}")
+    picture = study.path / "trials.png"
+    trials_figure(quartiles, environment, title).savefig(picture, dpi=110)
+    console.print(f"Picture: {picture}")
+
+
+def _print_quartiles(quartiles: xr.Dataset, optimum: float | None, title: str) -> None:
     names = ("lower_quartile", "median", "upper_quartile")
     rows = []
     for answers in quartiles["answers"].values:
@@ -152,37 +163,27 @@ def print_trials(study: Any) -> None:
         shares = [] if optimum is None else [f"{float(at[name]) / optimum:.3f}" for name in names]
         rows.append([f"{answers:g}", *(f"{float(at[name]):.2f}" for name in names), *shares])
     columns = ["answers", "25 %", "median", "75 %"] + ([] if optimum is None else ["25 %", "median", "75 %"])
-    title = f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials: quartiles of the value"
-    _table(title + ("" if optimum is None else ", and as a fraction of the optimum"), columns, rows)
-    if table.attrs["redraws"]:
-        seeds = table.attrs["redrawn_seeds"].replace(" ", ", ")
-        console.print(f"Redrawn for want of a preference: {table.attrs['redraws']} trials, seeds {seeds}.")
-    if "balancing_steps" in table:
-        survival, steps = 1 - table["terminated"].isel(iteration=-1), table["balancing_steps"]
-        console.print(
-            f"Final policies: {float(survival.mean()):.1%} of the evaluation episodes survive "
-            f"(worst trial {float(survival.min()):.1%}); they balance for {float(steps.median()):.0f} steps in the "
-            f"median trial, {float(steps.min()):.0f} in the worst, of {steps.attrs['max_steps']} at most."
-        )
+    fraction = "" if optimum is None else ", and as a fraction of the optimum"
+    _table(f"{title}: quartiles of the value{fraction}", columns, rows)
+
+
+def _print_balancing(survival: xr.DataArray, steps: xr.DataArray) -> None:
+    """The share of evaluation episodes that survive and the balancing time, each over seeds."""
+    console.print(
+        f"Final policies: {float(survival.mean()):.1%} of the evaluation episodes survive "
+        f"(worst trial {float(survival.min()):.1%}); the balancing time is {float(steps.median()):.0f} steps in the "
+        f"median trial, {float(steps.min()):.0f} in the worst, at most {steps.attrs['max_steps']}."
+    )
+
+
+def _print_numerics(table: xr.Dataset) -> None:
+    """How closely the updates met their bounds and constraints, and whether the fits converged."""
     active = table["bound_active"].values.astype(bool)
     deviation = abs(table["kl"] / table["kl_bound"] - 1).values[active].max(initial=0.0)
+    failed = np.sum(~table["utility_converged"].values.astype(bool))
     console.print(
-        f"KL bound active in {active.sum()} of {active.size} iterations, met within {deviation:.2%} there; "
-        f"whitened feature gap at most {float(table['feature_gap'].max()):.1e}, raw "
-        f"{float(table['feature_gap_raw'].max()):.1e}; rank kept {int(table['rank_kept'].min())} to "
-        f"{int(table['rank_kept'].max())}; utility fits not converged: "
-        f"{int((~table['utility_converged'].values.astype(bool)).sum())}."
+        f"KL bound active in {active.sum()} of {active.size} iterations and met there within {deviation:.2%}; "
+        f"feature gap at most {float(table['feature_gap'].max()):.1e} whitened, "
+        f"{float(table['feature_gap_raw'].max()):.1e} raw; rank kept {int(table['rank_kept'].min())} to "
+        f"{int(table['rank_kept'].max())}; utility fits that did not converge: {failed}."
     )
-    console.print(f"Tables: {study.path / 'trials.csv'}, {study.path / 'trials.nc'}")
-
-
-def draw_trials(study: Any) -> None:
-    """The learning curves of a study, beside its tables."""
-    from bayespbrl.diagnostics.plots import trials_figure
-    from bayespbrl.rollouts import open_environment
-
-    about = study.table.attrs
-    title = f"{about['env']}, {about['utility']}, {study.table.sizes['seed']} trials"
-    picture = study.path / "trials.png"
-    trials_figure(study.quartiles(), open_environment(about["env"]), title).savefig(picture, dpi=110)
-    console.print(f"Picture: {picture}")

@@ -1,4 +1,4 @@
-"""What many trials gave, as tables: the summaries of their iterations, and how long the final policies last."""
+"""The results of many trials as tables: the figures of each iteration, and the balancing time of the final policies."""
 
 import csv
 import json
@@ -18,8 +18,6 @@ from bayespbrl.runs.files import write_file, written_aside
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value")
 
-# Environments in which lasting is the task, and the most steps that an episode of the final policy may take.
-BALANCING_STEPS = {"bayespbrl/Bicycle-v0": 3000}
 BALANCING_COLUMNS = ("survival", "balancing_steps", "balancing_seconds")
 BALANCING_FILE = "balancing.json"
 
@@ -27,8 +25,8 @@ BALANCING_FILE = "balancing.json"
 def collect(directories: Sequence[Path | str]) -> xr.Dataset:
     """The summaries of finished runs as one data set over (seed, iteration).
 
-    Numbers and lists of numbers are kept, the latter with a dimension of their own, and those of an entry that has
-    names in it, as `seconds` has, under both names: `seconds_utility`. What is missing is NaN.
+    Numbers are kept, and lists of numbers with a dimension of their own. Those of a nested entry have both names, as
+    `seconds_utility`. Missing numbers are NaN.
     """
     summaries = [read_summary(path) for path in directories]
     seeds = [summary["seed"] for summary in summaries]
@@ -55,15 +53,15 @@ def collect(directories: Sequence[Path | str]) -> xr.Dataset:
 
 
 def by_answers(answers: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values over (seed, iteration) as values over (seed, answers), for trials that need not ask in step.
+    """Values by the number of answers, for trials whose iterations ask different numbers of questions.
 
     Args:
-      answers: given by each iteration, shape (S, I), never decreasing along it.
-      values: shape (S, I).
+      answers: in total up to each iteration, shape (S, I), never decreasing over iterations.
+      values: of the policy after each iteration, shape (S, I).
 
     Returns:
-      the n numbers of answers from the first that every trial has given on, shape (n,), and for each the value of a
-      trial's last policy before it asked for more, or ended, shape (S, n).
+      n numbers of answers, shape (n,), from the smallest that every trial has a policy for; and at each the value of a
+      trial's last policy with no more answers, shape (S, n).
     """
     numbers = np.unique(answers[answers >= answers[:, 0].max()])
     last = (answers[:, :, None] <= numbers).sum(axis=1) - 1
@@ -78,7 +76,7 @@ def _flat(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _figures(values: Sequence[Sequence[Any]]) -> np.ndarray | None:
-    """Numbers, or lists of numbers that are all as long, as one array; None for anything else."""
+    """Numbers, or lists of numbers of equal length, as one array; None for anything else."""
     flat = [value for row in values for value in row if value is not None]
     lengths = {len(value) if isinstance(value, list) else 0 for value in flat}
     if len(lengths) > 1 or not all(isinstance(value, int | float | list) for value in flat):
@@ -88,12 +86,12 @@ def _figures(values: Sequence[Sequence[Any]]) -> np.ndarray | None:
 
 
 def has_balancing(directory: Path | str) -> bool:
-    """Whether `measure_balancing` has left its file in a run directory."""
+    """Whether `measure_balancing` has written its file into a run directory."""
     return (Path(directory) / BALANCING_FILE).exists()
 
 
 def measure_balancing(learner: Learner, directory: Path, *, max_steps: int, episodes: int = 100) -> None:
-    """How many steps a learner's final policy lasts before a terminal state, in fresh episodes; into `balancing.json`.
+    """Measure the steps of a learner's final policy before a terminal state, over fresh episodes; in `balancing.json`.
 
     An episode that reaches `max_steps` counts as that many.
     """
@@ -109,10 +107,10 @@ def measure_balancing(learner: Learner, directory: Path, *, max_steps: int, epis
 
 
 def write_tables(table: xr.Dataset, directory: Path) -> None:
-    """`trials.csv`, one row a trial and iteration, and `trials.nc`, each whole or not at all.
+    """Write `trials.csv`, one row per trial and iteration, and `trials.nc`, each whole or not at all.
 
-    Where lasting is the task, the share of evaluation episodes that survive is a column more, and the balancing time
-    of the final policy two more, filled in the row of the last iteration.
+    Where a balancing time was measured there are three more columns: the share of evaluation episodes that survive, and
+    the balancing time of the final policy in steps and in seconds, in the row of the last iteration.
     """
     balancing = "balancing_steps" in table
     last = table["iteration"].values[-1]
