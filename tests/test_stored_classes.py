@@ -12,7 +12,7 @@ import xarray as xr
 
 from bayespbrl.features import OneHot, RadialBasis
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
-from bayespbrl.runs import stored_classes as records
+from bayespbrl.runs.stored_classes import STORED, from_tree, to_tree
 from bayespbrl.utility.estimate import FitQuality
 
 
@@ -35,16 +35,16 @@ class Outer:
     pair: tuple
 
 
-def through_a_file(record, tmp_path, known=()):
-    file = tmp_path / "record.nc"
-    xr.DataTree.from_dict({"record": records.to_tree(record)}).to_netcdf(file, engine="h5netcdf")
+def through_a_file(instance, tmp_path, known=()):
+    file = tmp_path / "instance.nc"
+    xr.DataTree.from_dict({"instance": to_tree(instance)}).to_netcdf(file, engine="h5netcdf")
     with xr.open_datatree(file, engine="h5netcdf") as tree:
-        return records.from_tree(tree.load().children["record"], known=known)
+        return from_tree(tree.load().children["instance"], known=known)
 
 
 def test_everything_comes_back_exactly(tmp_path):
     rng = np.random.default_rng(0)
-    record = Outer(
+    instance = Outer(
         inner=Inner(rng.normal(size=(3, 2)) * 10.0 ** rng.integers(-300, 300, (3, 2))),
         table=np.arange(6, dtype=np.int64).reshape(2, 3),
         scalar=np.asarray(1 / 3),
@@ -56,16 +56,16 @@ def test_everything_comes_back_exactly(tmp_path):
         nothing=None,
         pair=(1, 2.5),
     )
-    back = through_a_file(record, tmp_path, known=(Outer, Inner))
+    back = through_a_file(instance, tmp_path, known=(Outer, Inner))
     assert type(back) is Outer
     assert type(back.inner) is Inner
     for name in ("table", "scalar", "empty"):
-        stored, given = getattr(back, name), getattr(record, name)
+        stored, given = getattr(back, name), getattr(instance, name)
         assert (stored.dtype, stored.shape, stored.tobytes()) == (given.dtype, given.shape, given.tobytes())
-    assert back.inner.values.tobytes() == record.inner.values.tobytes()
+    assert back.inner.values.tobytes() == instance.inner.values.tobytes()
     for name in ("number", "count", "flag", "name", "nothing", "pair"):
-        assert getattr(back, name) == getattr(record, name)
-        assert type(getattr(back, name)) is type(getattr(record, name))
+        assert getattr(back, name) == getattr(instance, name)
+        assert type(getattr(back, name)) is type(getattr(instance, name))
 
 
 def test_what_is_not_finite_comes_back(tmp_path):
@@ -77,7 +77,7 @@ def test_what_is_not_finite_comes_back(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "record",
+    "instance",
     [
         OneHot(25),
         RadialBasis(np.random.default_rng(1).normal(size=(4, 2)), np.array([0.3, 0.7]), np.array([np.inf, 6.28])),
@@ -87,10 +87,10 @@ def test_what_is_not_finite_comes_back(tmp_path):
         ),
     ],
 )
-def test_features_and_policies_come_back_exactly(record, tmp_path):
-    back = through_a_file(record, tmp_path)
-    assert type(back) is type(record)
-    for name, value in vars(record).items():
+def test_features_and_policies_come_back_exactly(instance, tmp_path):
+    back = through_a_file(instance, tmp_path)
+    assert type(back) is type(instance)
+    for name, value in vars(instance).items():
         np.testing.assert_array_equal(getattr(back, name), value)
 
 
@@ -102,17 +102,17 @@ def test_arrays_of_jax_come_back_as_numpy(tmp_path):
     assert back.table.dtype == np.float64
 
 
-@pytest.mark.parametrize("record", [lambda states: states, Inner, Inner([1, 2]), Inner({"a": 1}), 3.0])
-def test_what_cannot_be_stored_is_refused(record):
-    with pytest.raises(ValueError, match="record: "):
-        records.to_tree(record)
+@pytest.mark.parametrize("instance", [lambda states: states, Inner, Inner([1, 2]), Inner({"a": 1}), 3.0])
+def test_what_cannot_be_stored_is_refused(instance):
+    with pytest.raises(ValueError, match="stored class: "):
+        to_tree(instance)
 
 
 def test_a_class_of_somebody_elses_is_not_made_unless_it_is_passed():
-    tree = records.to_tree(Inner(np.ones(2)))
-    with pytest.raises(ValueError, match="record: expected a class of bayespbrl or one that was passed again"):
-        records.from_tree(tree)
-    assert isinstance(records.from_tree(tree, known=(Inner,)), Inner)
+    tree = to_tree(Inner(np.ones(2)))
+    with pytest.raises(ValueError, match="stored class: expected a class of bayespbrl or one that was passed again"):
+        from_tree(tree)
+    assert isinstance(from_tree(tree, known=(Inner,)), Inner)
 
 
 @pytest.mark.parametrize(
@@ -126,23 +126,23 @@ def test_a_class_of_somebody_elses_is_not_made_unless_it_is_passed():
     ],
 )
 def test_a_foreign_file_cannot_name_anything_but_our_dataclasses(name):
-    tree = records.to_tree(OneHot(3))
+    tree = to_tree(OneHot(3))
     tree.attrs["class"] = name
-    with pytest.raises(ValueError, match="record: expected"):
-        records.from_tree(tree)
+    with pytest.raises(ValueError, match="stored class: expected"):
+        from_tree(tree)
 
 
 def test_files_name_classes_by_short_names_that_say_nothing_of_modules():
-    assert records.to_tree(OneHot(3)).attrs["class"] == "one-hot"
-    assert records.to_tree(Inner(np.ones(2))).attrs["class"] == "own:Inner"
-    for name, kind in records.STORED.items():
+    assert to_tree(OneHot(3)).attrs["class"] == "one-hot"
+    assert to_tree(Inner(np.ones(2))).attrs["class"] == "own:Inner"
+    for name, kind in STORED.items():
         assert re.fullmatch("[a-z-]+", name)
         assert dataclasses.is_dataclass(kind)
 
 
 @pytest.mark.parametrize("fields", ['{"number_of_states": 3, "colour": 1}', "{}", "not json"])
 def test_fields_that_do_not_fit_are_refused(fields):
-    tree = records.to_tree(OneHot(3))
+    tree = to_tree(OneHot(3))
     tree.attrs["fields"] = fields
     with pytest.raises(ValueError):  # noqa: PT011
-        records.from_tree(tree)
+        from_tree(tree)
