@@ -72,6 +72,16 @@ def flags(name: str, values: Any, number: int) -> np.ndarray:
     return array
 
 
+def indices(name: str, values: Any, number: int) -> np.ndarray:
+    """`values` as an int64 array of shape (N,), where they are integers in 0 … `number` − 1."""
+    array = np.asarray(values)
+    if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name}: expected integers of shape (N,), got {array.dtype} of shape {array.shape}")
+    if array.size and not (array.min() >= 0 and array.max() < number):
+        raise ValueError(f"{name}: expected numbers in 0 … {number - 1}, got {array.min()} … {array.max()}")
+    return array.astype(np.int64)
+
+
 def _is_number(value: Any) -> bool:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     return number and math.isfinite(value)

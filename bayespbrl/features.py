@@ -15,7 +15,7 @@ from gymnasium.spaces import Box, Discrete
 from jaxtyping import Float, Int, Shaped
 from numpy.typing import ArrayLike
 
-from bayespbrl.checks import matrix, positive, whole
+from bayespbrl.checks import indices, matrix, positive, whole
 from bayespbrl.kernels import as_periods, median_bandwidths, radial_basis
 from bayespbrl.trajectories import Trajectory, Transitions
 
@@ -33,16 +33,7 @@ class OneHot:
 
     def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n {self.number_of_states}"]:
         """Features of N integer observations."""
-        observations = np.asarray(observations)
-        if observations.ndim != 1 or not np.issubdtype(observations.dtype, np.integer):
-            raise ValueError(
-                f"observations: expected integers of shape (N,), got {observations.dtype} of shape {observations.shape}"
-            )
-        if observations.size and (observations.min() < 0 or observations.max() >= self.number_of_states):
-            raise ValueError(
-                f"observations: expected states in 0 … {self.number_of_states - 1}, "
-                f"got {observations.min()} … {observations.max()}"
-            )
+        observations = indices("observations", observations, self.number_of_states)
         features = np.zeros((len(observations), self.number_of_states))
         features[np.arange(len(observations)), observations] = 1.0
         return features

@@ -128,9 +128,7 @@ def main() -> None:
         features_row(number, arguments.repeats, rng)
         process = GaussianProcessPolicy.initial(STATES, TORQUE, period=PERIOD, initial_scale=0.9)
         continuous_rows("process", process, number, arguments.repeats, rng)
-        continuous_rows(
-            "process, hyperparameters kept", process, number, arguments.repeats, rng, hyperparameters="keep"
-        )
+        continuous_rows("process, hyperparameters kept", process, number, arguments.repeats, rng, evaluations=0)
         linear = LinearGaussianPolicy.initial(STATES, TORQUE, initial_scale=0.9)
         continuous_rows("linear-Gaussian", linear, number, arguments.repeats, rng)
         softmax_rows(number, arguments.repeats, rng)

@@ -232,7 +232,7 @@ def test_good_user_features_pass_as_float64():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda r: OneHot(3)(np.array([3])), "expected states in 0 … 2"),
+        (lambda r: OneHot(3)(np.array([3])), "expected numbers in 0 … 2"),
         (lambda r: OneHot(3)(np.array([0.5])), "expected integers"),
         (lambda r: draw_state_features(STATES, np.ones((4, 3)), RadialBasisOptions(2), rng=r), r"shape \(N, 2\)"),
         (lambda r: draw_state_features(STATES, np.full((4, 2), np.nan), RadialBasisOptions(2), rng=r), "NaN"),

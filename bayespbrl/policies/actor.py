@@ -8,8 +8,10 @@ import jax
 import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box
+from jaxtyping import Array, Key
 
 from bayespbrl.policies.batch import sample_actions
+from bayespbrl.policies.policy import Policy
 
 
 @dataclass(frozen=True)
@@ -17,20 +19,20 @@ class Actor:
     """A stochastic policy and the action space whose bounds its actions keep.
 
     Attributes:
-      policy: any `Policy`.
-      action_space: that the policy knows.
+      policy: stochastic policy.
+      action_space: of the policy's actions.
       rng: where a call without a key draws from.
-      observe: from an observation of the environment to one that the policy knows.
-      enact: from an action that the policy knows to one of the environment.
+      observe: from an observation of the environment to one of the policy's.
+      enact: from an action of the policy's to one of the environment.
     """
 
-    policy: Any
-    action_space: Space
+    policy: Policy
+    action_space: Space[Any]
     rng: np.random.Generator
     observe: Callable[[Any], Any] = np.asarray
     enact: Callable[[Any], Any] = np.asarray
 
-    def act(self, observation: Any, *, key: jax.Array | None = None) -> Any:
+    def act(self, observation: Any, *, key: Key[Array, ""] | None = None) -> Any:
         """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete."""
         if key is None:
             key = jax.random.key(int(self.rng.integers(2**31)))

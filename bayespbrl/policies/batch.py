@@ -1,19 +1,23 @@
 """A policy at many observations: any N, in chunks of one size, so that each function compiles once a policy type."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float, Key, Shaped
+from numpy.typing import ArrayLike
 
-from bayespbrl.policies.policy import Policy
+from bayespbrl.policies.policy import AnyArray, Policy
 
 CHUNK = 1024
 
 
 @jax.jit
-def _sample_chunk(policy: Any, key: jax.Array, start: jax.Array, observations: jax.Array) -> jax.Array:
+def _sample_chunk(
+    policy: Policy, key: Key[Array, ""], start: Shaped[AnyArray, ""], observations: Shaped[AnyArray, "n ..."]
+) -> Shaped[Array, "n ..."]:
     rows = start + jnp.arange(CHUNK, dtype=jnp.uint32)
     # one key a row, made from the row's number: the padding and the chunk size cannot change what a row draws
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, rows)
@@ -21,17 +25,19 @@ def _sample_chunk(policy: Any, key: jax.Array, start: jax.Array, observations: j
 
 
 @jax.jit
-def _log_prob_chunk(policy: Any, observations: jax.Array, actions: jax.Array) -> jax.Array:
+def _log_prob_chunk(
+    policy: Policy, observations: Shaped[AnyArray, "n ..."], actions: Shaped[AnyArray, "n ..."]
+) -> Float[Array, " n"]:
     return jax.vmap(policy.log_prob)(observations, actions)
 
 
 @jax.jit
-def _entropy_chunk(policy: Any, observations: jax.Array) -> jax.Array:
+def _entropy_chunk(policy: Policy, observations: Shaped[AnyArray, "n ..."]) -> Float[Array, " n"]:
     return jax.vmap(policy.entropy)(observations)
 
 
-def sample_actions(policy: Policy, key: jax.Array, observations: np.ndarray) -> np.ndarray:
-    """One action aᵢ ~ π(·|sᵢ) for each observation; shape (N, A) float64, or (N,) int64 where actions are discrete.
+def sample_actions(policy: Policy, key: Key[Array, ""], observations: ArrayLike) -> Shaped[np.ndarray, "n ..."]:
+    """One action aᵢ ~ π(·|sᵢ) for each observation, float64 vectors, or int64 where actions are discrete.
 
     Row i depends on `key` and i alone, not on N. Continuous actions are not clipped.
     """
@@ -39,23 +45,24 @@ def sample_actions(policy: Policy, key: jax.Array, observations: np.ndarray) -> 
         return _in_chunks(lambda start, rows: _sample_chunk(policy, key, np.uint32(start), rows), observations)
 
 
-def log_probabilities(policy: Policy, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """log π(aᵢ|sᵢ) for each row; shape (N,)."""
+def log_probabilities(policy: Policy, observations: ArrayLike, actions: ArrayLike) -> Float[np.ndarray, " n"]:
+    """log π(aᵢ|sᵢ) for each row."""
+    observations, actions = np.asarray(observations), np.asarray(actions)
     if len(observations) != len(actions):
         raise ValueError(f"actions: expected {len(observations)} rows, one an observation, got {len(actions)}")
     with jax.enable_x64(True):
         return _in_chunks(lambda _, *rows: _log_prob_chunk(policy, *rows), observations, actions)
 
 
-def entropies(policy: Policy, observations: np.ndarray) -> np.ndarray:
-    """Entropy of π(·|sᵢ) in nats for each observation; shape (N,)."""
+def entropies(policy: Policy, observations: ArrayLike) -> Float[np.ndarray, " n"]:
+    """Entropy of π(·|sᵢ) in nats for each observation."""
     with jax.enable_x64(True):
         return _in_chunks(lambda _, rows: _entropy_chunk(policy, rows), observations)
 
 
-def _in_chunks(function: Callable[..., jax.Array], *arrays: np.ndarray) -> np.ndarray:
-    """Apply `function(start, *rows)` to CHUNK rows of `arrays` at a time; the last chunk repeats the last row."""
-    arrays = tuple(np.asarray(a) for a in arrays)
+def _in_chunks(function: Callable[..., Array], *given: ArrayLike) -> Shaped[np.ndarray, "n ..."]:
+    """`function(start, *rows)` of CHUNK rows of `given` at a time; the last chunk repeats the last row."""
+    arrays = [np.asarray(a) for a in given]
     number = len(arrays[0])
     if number == 0:
         raise ValueError("observations: expected at least one row, got none")

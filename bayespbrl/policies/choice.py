@@ -4,20 +4,25 @@ from typing import Any
 
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete
+from numpy.typing import ArrayLike
 
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
+from bayespbrl.policies.policy import Policy
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
-# Share of a tabular policy's choices that stay uniform. On the Gridworld it costs 0.2 % of the optimum (the known
-# reward ends at 0.998) and keeps the dual well-conditioned; without it one fit in 500 failed.
-LEAST_EXPLORATION = 0.01
+LEAST_EXPLORATION = 0.01  # share of a tabular policy's choices that stay uniform, which keeps REPS well-conditioned
 
 
 def initial_policy(
-    kind: str, observation_space: Space, action_space: Space, *, action_scale: float = 0.75, period: Any = None
-) -> Any:
+    kind: str,
+    observation_space: Space[Any],
+    action_space: Space[Any],
+    *,
+    action_scale: float = 0.75,
+    period: ArrayLike | None = None,
+) -> Policy:
     """The first policy of a run: as random as the action space allows.
 
     Args:
@@ -27,7 +32,7 @@ def initial_policy(
       period: of each observation dimension, infinite where not periodic; None for none.
 
     Raises:
-      ValueError: a kind there is not, or spaces that it does not suit.
+      ValueError: unknown kind, or spaces that do not suit it.
     """
     if kind == "auto":
         if isinstance(action_space, Box):

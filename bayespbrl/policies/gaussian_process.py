@@ -5,14 +5,17 @@ range; far from all samples the policy returns to it, and to the variance s² + 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import Space
+from jax import Array
+from jaxtyping import Bool, Float, Int, Key, Shaped
 from numpy.typing import ArrayLike
 
+from bayespbrl.checks import matrix, positive, whole
 from bayespbrl.kernels import (
     as_periods,
     coordinates,
@@ -22,13 +25,14 @@ from bayespbrl.kernels import (
     radial_basis_row,
     squared_exponential,
 )
-from bayespbrl.policies.hyperparameter_search import Hyperparameters, search
-from bayespbrl.policies.samples import WeightedSamples, weighted_samples
-from bayespbrl.policies.spaces import centre_and_range, dimension
+from bayespbrl.policies.hyperparameter_search import Hyperparameters, OutputSamples, SearchResult, search
+from bayespbrl.policies.policy import AnyArray
+from bayespbrl.policies.samples import weighted_samples
+from bayespbrl.policies.spaces import centre_and_range, dimension, initial_deviation
 from bayespbrl.policies.sparse_regression import fit_sparse_regression, inducing_rows
 
-# From the last iteration's hyper-parameters 90 evaluations end within 0.005 nats a sample of 240 in the mean (Bicycle
-# and SwingUp, seed 100), which is less than the subsample itself decides.
+# Evaluations of the objective of the hyper-parameter search: in the first fit, and in those that begin where the last
+# one ended.
 FIRST_EVALUATIONS, LATER_EVALUATIONS = 240, 90
 
 
@@ -38,38 +42,38 @@ class GaussianProcessPolicy:
     """Predictive distributions of A sparse Gaussian processes with M inducing points each.
 
     Attributes:
-      inducing_points: Z in the observation's units, shape (A, M, S); unused ones have zero weights.
-      mean_weights: mean_j(s) = centre_j + r(s, Z_j)ᵀ mean_weights_j, with correlations r; shape (A, M).
-      reduction: var_j(s) = s²(1 − |reduction_j r(s, Z_j)|²) + σ²; shape (A, M, M).
-      bandwidths: shape (A, S), zero where a dimension is not used.
-      signal_variance, noise_variance: s² and σ² in the action's units squared, shape (A,).
-      action_centre, action_range: shape (A,).
-      period: shape (S,), infinite where not periodic.
+      inducing_points: Z in the observation's units; unused ones have zero weights.
+      mean_weights: mean_j(s) = centre_j + r(s, Z_j)ᵀ mean_weights_j, with correlations r.
+      reduction: var_j(s) = s²(1 − |reduction_j r(s, Z_j)|²) + σ².
+      bandwidths: zero where a dimension is not used.
+      signal_variance, noise_variance: s² and σ² in the action's units squared.
+      action_centre, action_range: of the action space.
+      period: infinite where not periodic.
       minimum_noise: lower bound of σ as a fraction of the action's range.
       fits: how many fits led here; zero for the initial policy.
-      objective: of the last hyper-parameter search, a unit of weight, shape (A,); NaN where there was none.
-      noise_at_bound: whether the last search left σ² on a bound, shape (A,).
+      objective: of the last hyper-parameter search, a unit of weight; NaN where there was none.
+      noise_at_bound: whether the last search left σ² on a bound.
     """
 
-    inducing_points: np.ndarray
-    mean_weights: np.ndarray
-    reduction: np.ndarray
-    bandwidths: np.ndarray
-    signal_variance: np.ndarray
-    noise_variance: np.ndarray
-    action_centre: np.ndarray
-    action_range: np.ndarray
-    period: np.ndarray
-    minimum_noise: np.ndarray
-    fits: np.ndarray
-    objective: np.ndarray
-    noise_at_bound: np.ndarray
+    inducing_points: Float[AnyArray, "a m s"]
+    mean_weights: Float[AnyArray, "a m"]
+    reduction: Float[AnyArray, "a m m"]
+    bandwidths: Float[AnyArray, "a s"]
+    signal_variance: Float[AnyArray, " a"]
+    noise_variance: Float[AnyArray, " a"]
+    action_centre: Float[AnyArray, " a"]
+    action_range: Float[AnyArray, " a"]
+    period: Float[AnyArray, " s"]
+    minimum_noise: Float[AnyArray, ""]
+    fits: Int[AnyArray, ""]
+    objective: Float[AnyArray, " a"]
+    noise_at_bound: Bool[AnyArray, " a"]
 
     @classmethod
     def initial(
         cls,
-        observation_space: Space,
-        action_space: Space,
+        observation_space: Space[Any],
+        action_space: Space[Any],
         *,
         period: ArrayLike | None = None,
         initial_scale: ArrayLike = 0.5,
@@ -86,34 +90,34 @@ class GaussianProcessPolicy:
         """
         states, actions = dimension("observation_space", observation_space), dimension("action_space", action_space)
         centre, width = centre_and_range("action_space", action_space)
-        scale = np.broadcast_to(np.asarray(initial_scale, dtype=np.float64), (actions,))
-        for name, value in (("initial_scale", scale), ("minimum_noise", minimum_noise)):
-            if not np.all((np.asarray(value) > 0) & np.isfinite(value)):
-                raise ValueError(f"{name}: expected a finite number > 0, got {value}")
-        if number_of_inducing_points < 1:
-            raise ValueError(f"number_of_inducing_points: expected at least 1, got {number_of_inducing_points}")
-        inducing = number_of_inducing_points
+        variance = 0.5 * np.square(initial_deviation(initial_scale, width))
+        inducing = whole("number_of_inducing_points", number_of_inducing_points)
         return cls(
             inducing_points=np.zeros((actions, inducing, states)),
             mean_weights=np.zeros((actions, inducing)),
             reduction=np.zeros((actions, inducing, inducing)),
             bandwidths=np.zeros((actions, states)),
-            signal_variance=0.5 * np.square(scale * width),
-            noise_variance=0.5 * np.square(scale * width),
+            signal_variance=variance,
+            noise_variance=variance,
             action_centre=centre,
             action_range=width,
             period=as_periods(period, states),
-            minimum_noise=np.asarray(float(minimum_noise)),
+            minimum_noise=np.asarray(positive("minimum_noise", minimum_noise)),
             fits=np.asarray(0),
             objective=np.full(actions, np.nan),
             noise_at_bound=np.zeros(actions, dtype=bool),
         )
 
-    def moments(self, observation: Any) -> tuple[Any, Any]:
-        """Mean and variance of each action dimension at one observation, traceable; shapes (A,), (A,). O(AM²)."""
+    def moments(self, observation: Float[AnyArray, " s"]) -> tuple[Float[Array, " a"], Float[Array, " a"]]:
+        """Mean and variance of each action dimension at one observation, traceable. O(AM²)."""
 
-        def one(points, bandwidths, mean_weights, reduction):
-            correlations = radial_basis_row(observation, points, bandwidths, self.period)
+        def one(
+            points: Float[Array, "m s"],
+            bandwidths: Float[Array, " s"],
+            mean_weights: Float[Array, " m"],
+            reduction: Float[Array, "m m"],
+        ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+            correlations = radial_basis_row(jnp.asarray(observation), points, bandwidths, self.period)
             return correlations @ mean_weights, jnp.sum(jnp.square(reduction @ correlations))
 
         mean, explained = jax.vmap(one)(
@@ -122,25 +126,25 @@ class GaussianProcessPolicy:
             jnp.asarray(self.mean_weights),
             jnp.asarray(self.reduction),
         )
-        variance = self.signal_variance * jnp.maximum(1.0 - explained, 0.0) + self.noise_variance
-        return self.action_centre + mean, variance
+        variance = jnp.asarray(self.signal_variance) * jnp.maximum(1.0 - explained, 0.0) + self.noise_variance
+        return jnp.asarray(self.action_centre) + mean, variance
 
-    def sample(self, key: jax.Array, observation: Any) -> Any:
-        """a ~ N(mean, var), shape (A,), not clipped."""
+    def sample(self, key: Key[Array, ""], observation: Float[AnyArray, " s"]) -> Float[Array, " a"]:
+        """a ~ N(mean, var), not clipped."""
         mean, variance = self.moments(observation)
         return mean + jnp.sqrt(variance) * jax.random.normal(key, mean.shape, mean.dtype)
 
-    def log_prob(self, observation: Any, action: Any) -> Any:
+    def log_prob(self, observation: Float[AnyArray, " s"], action: Float[AnyArray, " a"]) -> Float[Array, ""]:
         """log density of an (unclipped) action."""
         mean, variance = self.moments(observation)
         return -0.5 * jnp.sum(jnp.square(action - mean) / variance + jnp.log(2 * jnp.pi * variance))
 
-    def entropy(self, observation: Any) -> Any:
+    def entropy(self, observation: Float[AnyArray, " s"]) -> Float[Array, ""]:
         """Differential entropy of π(·|s) in nats."""
         return 0.5 * jnp.sum(jnp.log(2 * jnp.pi * jnp.e * self.moments(observation)[1]))
 
-    def mean_and_variance(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`moments` at N observations by matrix products; shapes (N, A), (N, A)."""
+    def mean_and_variance(self, observations: ArrayLike) -> tuple[Float[np.ndarray, "n a"], Float[np.ndarray, "n a"]]:
+        """`moments` at N observations by matrix products."""
         observations = np.asarray(observations, dtype=np.float64)
         means, explained = [], []
         for points, bandwidths, mean_weights, reduction in zip(
@@ -153,12 +157,12 @@ class GaussianProcessPolicy:
         variance = np.asarray(self.signal_variance) * left + np.asarray(self.noise_variance)
         return np.asarray(self.action_centre) + np.stack(means, axis=1), variance
 
-    def action_standard_deviation(self, observations: np.ndarray) -> np.ndarray:
-        """Standard deviation of the action at each observation, in the action's units; shape (N, A)."""
+    def action_standard_deviation(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
+        """Standard deviation of the action at each of N observations, in the action's units."""
         return np.sqrt(self.mean_and_variance(observations)[1])
 
-    def kl_divergence(self, old: Self, observations: np.ndarray) -> np.ndarray:
-        """KL(self ‖ old) of the two normal distributions at each observation, shape (N,)."""
+    def kl_divergence(self, old: Self, observations: ArrayLike) -> Float[np.ndarray, " n"]:
+        """KL(self ‖ old) of the two normal distributions at each of N observations."""
         mean, variance = self.mean_and_variance(observations)
         old_mean, old_variance = old.mean_and_variance(observations)
         ratio = variance / old_variance
@@ -168,114 +172,98 @@ class GaussianProcessPolicy:
 
     def fit(
         self,
-        observations: np.ndarray,
-        actions: np.ndarray,
-        sample_weights: np.ndarray,
+        observations: ArrayLike,
+        actions: ArrayLike,
+        sample_weights: ArrayLike,
         *,
         rng: np.random.Generator,
-        base_weights: np.ndarray | None = None,
-        hyperparameters: Literal["held-out", "training-error", "keep"] = "held-out",
+        base_weights: ArrayLike | None = None,
         evaluations: int | None = None,
     ) -> Self:
-        """Condition the prior on samples with noise σ²/wᵢ, new inducing points and, unless kept, hyper-parameters.
+        """Condition the prior on samples with noise σ²/wᵢ, at new inducing points and hyper-parameters.
 
         The weights' scale matters, for σ² is the noise of a sample of weight one: wᵢ of mean 1 under W.
 
         Args:
           observations, actions: sᵢ (N, S) and unclipped aᵢ (N, A).
           sample_weights, base_weights: wᵢ = pᵢ/Wᵢ and Wᵢ, shape (N,); see `Policy.fit`.
-          hyperparameters: objective of the CMA-ES search ("training-error" is the paper's); "keep" keeps the old ones,
-            and takes the median rule's bandwidths if there are none yet.
-          evaluations: of the objective, for each action dimension; None for `FIRST_EVALUATIONS` in the first fit and
-            `LATER_EVALUATIONS` in those that begin where the last one ended.
+          evaluations: of the objective of the hyper-parameter search, for each action dimension; None for
+            `FIRST_EVALUATIONS` in the first fit and `LATER_EVALUATIONS` after it. 0 keeps the hyper-parameters, and
+            takes the median rule's bandwidths if there are none yet.
         """
-        if hyperparameters not in ("held-out", "training-error", "keep"):
-            raise ValueError(
-                f'hyperparameters: expected "held-out", "training-error" or "keep", got {hyperparameters!r}'
-            )
-        number, dimensions = self.inducing_points.shape[0], self.inducing_points.shape[2]
+        number, _, dimensions = self.inducing_points.shape
         samples = weighted_samples(
-            observations,
-            actions,
+            matrix("observations", observations, columns=dimensions),
+            matrix("actions", actions, columns=number),
             sample_weights,
             base_weights,
-            observation_dimension=dimensions,
-            action_dimension=number,
         )
-        rule = median_bandwidths(samples.observations, period=self.period, rng=rng)
-        new: dict[str, list] = {name: [] for name in _FITTED}
+        if evaluations is None:
+            evaluations = LATER_EVALUATIONS if int(self.fits) > 0 else FIRST_EVALUATIONS
+        whole("evaluations", evaluations, least=0)
+        period = np.asarray(self.period)
+        rule = median_bandwidths(samples.observations, period=period, rng=rng)
+        outputs = []
         for output in range(number):
-            for name, value in self._fit_output(output, samples, rule, rng, hyperparameters, evaluations).items():
-                new[name].append(value)
-        stacked = {name: np.stack(values) for name, values in new.items()}
+            targets = samples.actions[:, output] - self.action_centre[output]
+            own = OutputSamples(samples.observations, targets, samples.weights, period)
+            found = self._searched(output, own, rule, evaluations, rng)
+            outputs.append(_found(found) | self._condition(own, found.hyperparameters, rng))
+        stacked = {name: np.stack([fitted[name] for fitted in outputs]) for name in outputs[0]}
         return replace(self, fits=np.asarray(int(self.fits) + 1), **stacked)
 
-    def fit_mean(self, *samples: np.ndarray, **options: Any) -> Self:
+    def fit_mean(
+        self,
+        observations: ArrayLike,
+        actions: ArrayLike,
+        sample_weights: ArrayLike,
+        *,
+        rng: np.random.Generator,
+        base_weights: ArrayLike | None = None,
+    ) -> Self:
         """`fit` with the hyper-parameters held: noise and signal variance, bandwidths."""
-        kept = self.fit(*samples, hyperparameters="keep", **options)
+        kept = self.fit(observations, actions, sample_weights, rng=rng, base_weights=base_weights, evaluations=0)
         return replace(kept, objective=self.objective, noise_at_bound=self.noise_at_bound)
 
-    def _fit_output(
+    def _searched(
         self,
         output: int,
-        samples: WeightedSamples,
-        rule: np.ndarray,
+        samples: OutputSamples,
+        rule: Float[np.ndarray, " s"],
+        evaluations: int,
         rng: np.random.Generator,
-        hyperparameters: str,
-        evaluations: int | None,
-    ) -> dict[str, Any]:
-        """The arrays of `_FITTED` for one action dimension; `rule` are the median rule's bandwidths."""
-        targets = samples.actions[:, output] - self.action_centre[output]
-        parameters = self._start(output, rule)
-        objective, at_bound = np.nan, False
-        if hyperparameters != "keep":
-            floor = float(np.square(self.minimum_noise * self.action_range[output]))
-            square = max(float(samples.weights @ np.square(targets) / samples.weights.sum()), floor)
-            reference = Hyperparameters(rule, square, square)
-            later = int(self.fits) > 0
-            if evaluations is None:
-                evaluations = LATER_EVALUATIONS if later else FIRST_EVALUATIONS
-            result = search(
-                samples.observations,
-                targets,
-                samples.weights,
-                start=parameters if later else Hyperparameters(rule, 0.5 * square, 0.5 * square),
-                reference=reference,
-                minimum_noise_variance=floor,
-                period=self.period,
-                rng=rng,
-                objective="held-out" if hyperparameters == "held-out" else "training-error",
-                step_size=0.3 if later else 0.7,
-                evaluations=evaluations,
-            )
-            parameters, objective, at_bound = result.hyperparameters, result.objective, result.at_bound
-        return {
-            **self._condition(samples, targets, parameters, rng),
-            "bandwidths": parameters.bandwidths,
-            "signal_variance": np.asarray(parameters.signal_variance),
-            "noise_variance": np.asarray(parameters.noise_variance),
-            "objective": np.asarray(objective),
-            "noise_at_bound": np.asarray(at_bound),
-        }
-
-    def _start(self, output: int, rule: np.ndarray) -> Hyperparameters:
-        """The old hyper-parameters; the median rule for a bandwidth that had none, none for a constant dimension."""
+    ) -> SearchResult:
+        """Hyper-parameters of one action dimension, the old ones without any evaluation; `rule` is the median rule."""
+        # the median rule stands for a bandwidth that there was none of; a constant dimension has none
         old = np.asarray(self.bandwidths[output])
         bandwidths = np.where(rule > 0, np.where(old > 0, old, rule), 0.0)
-        return Hyperparameters(bandwidths, float(self.signal_variance[output]), float(self.noise_variance[output]))
+        held = Hyperparameters(bandwidths, float(self.signal_variance[output]), float(self.noise_variance[output]))
+        if evaluations == 0:
+            return SearchResult(held, np.nan, at_bound=False)
+        later = int(self.fits) > 0
+        return search(
+            samples,
+            start=held if later else None,
+            rule=rule,
+            minimum_noise_variance=float(np.square(self.minimum_noise * self.action_range[output])),
+            step_size=0.3 if later else 0.7,
+            evaluations=evaluations,
+            rng=rng,
+        )
 
     def _condition(
-        self, samples: WeightedSamples, targets: np.ndarray, parameters: Hyperparameters, rng: np.random.Generator
-    ) -> dict[str, np.ndarray]:
+        self, samples: OutputSamples, parameters: Hyperparameters, rng: np.random.Generator
+    ) -> dict[str, Float[np.ndarray, "..."]]:
         """Inducing points and the posterior that goes with them, padded to M with points of no weight."""
         size = self.inducing_points.shape[1]
-        points = coordinates(samples.observations, self.period) * inverse_bandwidths(parameters.bandwidths, self.period)
+        scale = inverse_bandwidths(parameters.bandwidths, samples.period)
+        points = coordinates(samples.observations, samples.period) * scale
         rows = inducing_rows(points, samples.weights, size, rng=rng)
         centres = points[rows]
         regression = fit_sparse_regression(
             squared_exponential(centres, points),
             squared_exponential(centres, centres),
-            targets,
+            samples.targets,
             samples.weights,
             signal_variance=parameters.signal_variance,
             noise_variance=parameters.noise_variance,
@@ -288,13 +276,13 @@ class GaussianProcessPolicy:
         }
 
 
-_FITTED = (
-    "inducing_points",
-    "mean_weights",
-    "reduction",
-    "bandwidths",
-    "signal_variance",
-    "noise_variance",
-    "objective",
-    "noise_at_bound",
-)
+def _found(result: SearchResult) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """What a search found, under the policy's names."""
+    parameters = result.hyperparameters
+    return {
+        "bandwidths": parameters.bandwidths,
+        "signal_variance": np.asarray(parameters.signal_variance),
+        "noise_variance": np.asarray(parameters.noise_variance),
+        "objective": np.asarray(result.objective),
+        "noise_at_bound": np.asarray(result.at_bound),
+    }

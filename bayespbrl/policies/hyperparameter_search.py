@@ -1,39 +1,60 @@
 """Hyper-parameters of the Gaussian process policy by CMA-ES after each iteration (paper, experiments).
 
-The objective is the two-fold held-out weighted predictive log-likelihood (specification, section 8), on a random
-subsample of bounded size and with few inducing points, so that the cost does not depend on N. The paper's own, the
-training-set error, stays as an option: it cannot identify the noise variance, which ends exploration.
+Decision: the objective is the weighted predictive log-likelihood of two held-out halves, not the paper's training-set
+error, which cannot identify the noise variance. It is computed on a random subsample of bounded size and with few
+inducing points, so that the cost does not depend on N.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from cmaes import CMA
+from jaxtyping import Float, Int
 
 from bayespbrl.kernels import coordinates, inverse_bandwidths, squared_exponential
 from bayespbrl.policies.sparse_regression import inducing_rows, precisions, whitened_correlations
 
-Objective = Literal["held-out", "training-error"]
+SUBSAMPLE, INDUCING_POINTS = 800, 50  # what the objective is computed with
 FAILED = 1e10  # the cost of hyper-parameters at which the linear algebra breaks down
 
 
 @dataclass(frozen=True, eq=False)
-class Hyperparameters:
-    """Of one output: bandwidths (S,) in the observation's units, variances in the action's units squared."""
+class OutputSamples:
+    """Samples of one output.
 
-    bandwidths: np.ndarray
+    Attributes:
+      observations: xᵢ.
+      targets: yᵢ, about their prior mean.
+      weights: wᵢ > 0.
+      period: of each observation dimension, infinite where not periodic.
+    """
+
+    observations: Float[np.ndarray, "n s"]
+    targets: Float[np.ndarray, " n"]
+    weights: Float[np.ndarray, " n"]
+    period: Float[np.ndarray, " s"]
+
+    def rows(self, chosen: Int[np.ndarray, " m"]) -> "OutputSamples":
+        """Some of the samples."""
+        return OutputSamples(self.observations[chosen], self.targets[chosen], self.weights[chosen], self.period)
+
+
+@dataclass(frozen=True, eq=False)
+class Hyperparameters:
+    """Of one output: bandwidths in the observation's units, variances in the action's units squared."""
+
+    bandwidths: Float[np.ndarray, " s"]
     signal_variance: float
     noise_variance: float
 
     @property
-    def logarithms(self) -> np.ndarray:
+    def logarithms(self) -> Float[np.ndarray, " p"]:
         """log b of the dimensions that are used (b > 0), then log s², log σ²."""
         used = self.bandwidths[self.bandwidths > 0]
         return np.log(np.concatenate([used, [self.signal_variance, self.noise_variance]]))
 
-    def replaced(self, logarithms: np.ndarray) -> "Hyperparameters":
+    def replaced(self, logarithms: Float[np.ndarray, " p"]) -> "Hyperparameters":
         """The same dimensions with other values, given as `logarithms`."""
         values = np.exp(logarithms)
         bandwidths = np.zeros_like(self.bandwidths)
@@ -47,59 +68,46 @@ class SearchResult:
 
     Attributes:
       hyperparameters: the best ones seen, the start included.
-      objective: theirs: log-likelihood a unit of weight (nats), or minus the weighted mean squared error.
-      start_objective: that of the start, clipped to the bounds.
-      evaluations: of the objective.
+      objective: their log-likelihood a unit of weight (nats).
       at_bound: whether the best noise variance lies on one of its bounds.
     """
 
     hyperparameters: Hyperparameters
     objective: float
-    start_objective: float
-    evaluations: int
     at_bound: bool
 
 
 def search(
-    observations: np.ndarray,
-    targets: np.ndarray,
-    weights: np.ndarray,
+    samples: OutputSamples,
     *,
-    start: Hyperparameters,
-    reference: Hyperparameters,
+    start: Hyperparameters | None,
+    rule: Float[np.ndarray, " s"],
     minimum_noise_variance: float,
-    period: np.ndarray,
-    rng: np.random.Generator,
-    objective: Objective = "held-out",
-    step_size: float = 0.5,
+    step_size: float,
     evaluations: int,
-    subsample: int = 800,
-    inducing_points: int = 50,
+    rng: np.random.Generator,
 ) -> SearchResult:
-    """CMA-ES over log b, log s², log σ², from `start`.
+    """CMA-ES over log b, log s², log σ².
+
+    Bounds, with the weighted mean square ȳ² of the targets: b in [b̄/20, 20 b̄], s² in [ȳ²/1000, 10 ȳ²], σ² in
+    [minimum_noise_variance, 2 ȳ²].
 
     Args:
-      observations, targets, weights: xᵢ (N, S), yᵢ and wᵢ > 0 (N,); the targets about their prior mean.
-      reference: the median rule's bandwidths b̄ (zero: dimension not used) and the weighted mean square ȳ² of the
-        targets in both variances. Bounds: b in [b̄/20, 20 b̄], s² in [ȳ²/1000, 10 ȳ²], σ² in
-        [minimum_noise_variance, 2 ȳ²].
+      start: where to begin, clipped to the bounds; b̄ and ȳ²/2 when None.
+      rule: the median rule's bandwidths b̄; zero for a dimension that is not used.
       step_size: initial, in the logarithms.
+      evaluations: of the objective, at most.
     """
-    chosen = rng.choice(len(targets), size=min(subsample, len(targets)), replace=False)
-    data = (observations[chosen], targets[chosen], weights[chosen])
-    centre = reference.logarithms
-    reach = np.full(len(centre), np.log(20.0))
-    low, high = centre - reach, centre + reach
-    low[-2:] = centre[-2] - np.log(1000.0), np.log(minimum_noise_variance)
-    high[-2:] = centre[-2] + np.log(10.0), max(centre[-1] + np.log(2.0), low[-1] + 1e-3)
-    first = np.clip(start.logarithms, low, high)
-    cost = _cost(data, reference.replaced(first), period=period, rng=rng, objective=objective, number=inducing_points)
-
-    optimiser = CMA(
-        mean=first, sigma=step_size, bounds=np.column_stack([low, high]), seed=int(rng.integers(2**31)), lr_adapt=False
-    )
-    best, best_cost = first, cost(first)
-    start_cost, used = best_cost, 1
+    square = max(float(samples.weights @ np.square(samples.targets) / samples.weights.sum()), minimum_noise_variance)
+    number = len(samples.targets)
+    chosen = rng.choice(number, size=min(SUBSAMPLE, number), replace=False)
+    reference = Hyperparameters(rule, square, square)
+    low, high = _bounds(reference.logarithms, minimum_noise_variance)
+    first = np.clip((start or Hyperparameters(rule, 0.5 * square, 0.5 * square)).logarithms, low, high)
+    cost = _cost(samples.rows(chosen), reference.replaced(first), rng)
+    bounds, seed = np.column_stack([low, high]), int(rng.integers(2**31))
+    optimiser = CMA(mean=first, sigma=step_size, bounds=bounds, seed=seed, lr_adapt=False)
+    best, best_cost, used = first, cost(first), 1
     while used + optimiser.population_size <= evaluations and not optimiser.should_stop():
         candidates = [optimiser.ask() for _ in range(optimiser.population_size)]
         costs = [cost(candidate) for candidate in candidates]
@@ -108,36 +116,35 @@ def search(
         if min(costs) < best_cost:
             best_cost = min(costs)
             best = candidates[int(np.argmin(costs))]
-    return SearchResult(
-        hyperparameters=reference.replaced(best),
-        objective=-best_cost,
-        start_objective=-start_cost,
-        evaluations=used,
-        at_bound=bool(min(best[-1] - low[-1], high[-1] - best[-1]) < 1e-2),
-    )
+    at_bound = bool(min(best[-1] - low[-1], high[-1] - best[-1]) < 1e-2)
+    return SearchResult(reference.replaced(best), -best_cost, at_bound)
+
+
+def _bounds(
+    centre: Float[np.ndarray, " p"], minimum_noise_variance: float
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Lower and upper bounds of the logarithms, about those of b̄, ȳ² and ȳ²."""
+    reach = np.full(len(centre), np.log(20.0))
+    low, high = centre - reach, centre + reach
+    low[-2:] = centre[-2] - np.log(1000.0), np.log(minimum_noise_variance)
+    high[-2:] = centre[-2] + np.log(10.0), max(centre[-1] + np.log(2.0), low[-1] + 1e-3)
+    return low, high
 
 
 def _cost(
-    data: tuple[np.ndarray, np.ndarray, np.ndarray],
-    start: Hyperparameters,
-    *,
-    period: np.ndarray,
-    rng: np.random.Generator,
-    objective: Objective,
-    number: int,
-) -> Callable[[np.ndarray], float]:
+    samples: OutputSamples, start: Hyperparameters, rng: np.random.Generator
+) -> Callable[[Float[np.ndarray, " p"]], float]:
     """The function of the logarithms that CMA-ES minimises; folds and inducing points are fixed before it starts."""
-    observations, targets, weights = data
-    points = coordinates(observations, period)
+    points, period = coordinates(samples.observations, samples.period), samples.period
     scale = inverse_bandwidths(start.bandwidths, period)
-    inducing = points[inducing_rows(points * scale, weights, number, rng=rng)]
-    order, middle = rng.permutation(len(targets)), len(targets) // 2
-    points, targets, weights = points[order], targets[order], weights[order]  # so that a fold is a view
+    inducing = points[inducing_rows(points * scale, samples.weights, INDUCING_POINTS, rng=rng)]
+    order, middle = rng.permutation(len(points)), len(points) // 2
+    points, targets, weights = points[order], samples.targets[order], samples.weights[order]  # so that a fold is a view
     folds = [(slice(middle), slice(middle, None)), (slice(middle, None), slice(middle))]
-    if objective == "training-error" or not middle:
-        folds = [(slice(None), slice(None))]
+    if not middle:
+        folds = [(slice(None), slice(None))]  # one sample cannot be halved
 
-    def cost(logarithms: np.ndarray) -> float:
+    def cost(logarithms: Float[np.ndarray, " p"]) -> float:
         parameters = start.replaced(logarithms)
         scale = inverse_bandwidths(parameters.bandwidths, period)
         centres = inducing * scale
@@ -149,25 +156,23 @@ def _cost(
             for train, test in folds:
                 mean, variance = _predict(whitened, targets, weights, train, test, parameters)
                 errors = np.square(targets[test] - mean)
-                if objective == "held-out":
-                    errors = 0.5 * (errors / variance + np.log(2 * np.pi * variance))
-                total += float(weights[test] @ errors)
+                total += float(weights[test] @ (0.5 * (errors / variance + np.log(2 * np.pi * variance))))
         except np.linalg.LinAlgError:
             return FAILED
-        return total / weights.sum() if np.isfinite(total) else FAILED
+        return float(total / weights.sum()) if np.isfinite(total) else FAILED
 
     return cost
 
 
 def _predict(
-    whitened: np.ndarray,
-    targets: np.ndarray,
-    weights: np.ndarray,
+    whitened: Float[np.ndarray, "m n"],
+    targets: Float[np.ndarray, " n"],
+    weights: Float[np.ndarray, " n"],
     train: slice,
     test: slice,
     parameters: Hyperparameters,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Predictive mean and variance of the samples `test` from the samples `train`."""
+) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
+    """Predictive mean and variance of the samples `test` from the samples `train` (Snelson and Ghahramani 2006)."""
     signal, noise = parameters.signal_variance, parameters.noise_variance
     seen, new = whitened[:, train], whitened[:, test]
     scaled = seen * precisions(seen, weights[train], signal_variance=signal, noise_variance=noise)

@@ -5,6 +5,10 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from gymnasium import Space
 from jax import Array
+from jaxtyping import Float, Key, Shaped
+from numpy.typing import ArrayLike
+
+AnyArray = Array | np.ndarray  # a policy holds NumPy's arrays, within a trace JAX's
 
 
 @runtime_checkable
@@ -14,42 +18,42 @@ class Policy(Protocol):
     The methods that take a single observation are JAX-traceable, so that a rollout compiled once takes any policy of
     the same type as an argument (`batch` maps them over N observations); the others take and return NumPy arrays.
     Policies over discrete actions also have `probabilities(observations) -> (N, A)`, those over continuous actions
-    `action_standard_deviation(observations) -> (N, A)`; and they may have `fit_mean`, called as `fit` is, which holds
-    the spread and takes its place in all but the first update of an iteration.
+    `action_standard_deviation(observations) -> (N, A)`. They may have `fit_mean`, called as `fit` is, which holds the
+    spread; it takes the place of `fit` in all but the first update of an iteration.
     """
 
     @classmethod
-    def initial(cls, observation_space: Space, action_space: Space) -> Self:
+    def initial(cls, observation_space: Space[Any], action_space: Space[Any]) -> Self:
         """The policy before any fit; keyword options are each policy's own.
 
         `ValueError` where the spaces do not suit this kind of policy.
         """
         ...
 
-    def sample(self, key: Array, observation: Any) -> Any:
+    def sample(self, key: Key[Array, ""], observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
         """One action for one observation. Continuous actions are not clipped: the environment does that."""
         ...
 
-    def log_prob(self, observation: Any, action: Any) -> Any:
-        """log π(a|s): the log mass of a discrete action, the log density of a continuous one. Scalar."""
+    def log_prob(self, observation: Shaped[AnyArray, "..."], action: Shaped[AnyArray, "..."]) -> Float[Array, ""]:
+        """log π(a|s): the log mass of a discrete action, the log density of a continuous one."""
         ...
 
-    def entropy(self, observation: Any) -> Any:
-        """Entropy of π(·|s) in nats (differential for continuous actions). Scalar."""
+    def entropy(self, observation: Shaped[AnyArray, "..."]) -> Float[Array, ""]:
+        """Entropy of π(·|s) in nats (differential for continuous actions)."""
         ...
 
-    def kl_divergence(self, old: Self, observations: np.ndarray) -> np.ndarray:
-        """KL(self(·|s) ‖ old(·|s)) at each observation, in closed form. Shape (N,)."""
+    def kl_divergence(self, old: Self, observations: ArrayLike) -> Float[np.ndarray, " n"]:
+        """KL(self(·|s) ‖ old(·|s)) at each of N observations, in closed form."""
         ...
 
     def fit(
         self,
-        observations: np.ndarray,
-        actions: np.ndarray,
-        sample_weights: np.ndarray,
+        observations: ArrayLike,
+        actions: ArrayLike,
+        sample_weights: ArrayLike,
         *,
         rng: np.random.Generator,
-        base_weights: np.ndarray | None = None,
+        base_weights: ArrayLike | None = None,
     ) -> Self:
         """A new policy by weighted maximum likelihood (eq. 14); `self`, the old one, is the warm start.
 
@@ -63,6 +67,6 @@ class Policy(Protocol):
         ...
 
 
-def is_discrete(policy: Any) -> bool:
+def is_discrete(policy: object) -> bool:
     """Whether a policy's actions can be enumerated."""
     return hasattr(policy, "probabilities")

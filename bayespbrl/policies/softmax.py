@@ -11,9 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import Space
+from jax import Array
+from jaxtyping import Bool, Float, Int, Key
 from numpy.typing import ArrayLike
 from scipy.special import rel_entr
 
+from bayespbrl.checks import indices, matrix, positive, whole
 from bayespbrl.kernels import (
     as_periods,
     coordinates,
@@ -23,11 +26,13 @@ from bayespbrl.kernels import (
     radial_basis_row,
     squared_exponential,
 )
-from bayespbrl.policies.samples import WeightedSamples, weighted_samples
+from bayespbrl.policies.policy import AnyArray
+from bayespbrl.policies.samples import WeightedSamples, location_and_deviation, weighted_samples
 from bayespbrl.policies.spaces import dimension, number_of_values
 from bayespbrl.policies.sparse_regression import inducing_rows, inverse_factor
 
 DECREMENT = 1e-12  # the fit has converged where its quadratic model promises less than half of this, in nats
+NEWTON_STEPS = 50  # at most, O(N A²M²) each; `converged` says whether they sufficed
 
 
 @jax.tree_util.register_dataclass
@@ -36,12 +41,12 @@ class SoftmaxPolicy:
     """Logits f(s) = intercepts + slopes · (s − location)/scale + kernel_weights · r(s), r the M radial basis functions.
 
     Attributes:
-      intercepts, slopes, kernel_weights: shapes (A,), (A, S), (A, M).
-      location, scale: of the observations of the last fit, shape (S,); the scale of a constant or periodic dimension is
-        infinite (no linear function is periodic).
-      centres: shape (M, S); unused ones have zero weights.
-      bandwidths: shape (S,).
-      period: shape (S,), infinite where not periodic.
+      intercepts, slopes, kernel_weights: of each action's logit.
+      location, scale: of the observations of the last fit; the scale of a constant or periodic dimension is infinite
+        (no linear function is periodic).
+      centres: unused ones have zero weights.
+      bandwidths: zero where a dimension is constant.
+      period: infinite where not periodic.
       bandwidth_factor: of the median rule.
       prior_scale: prior standard deviation of each logit's three parts.
       fits: how many fits led here.
@@ -49,25 +54,25 @@ class SoftmaxPolicy:
       newton_decrement: twice what the last fit has left to gain, by its quadratic model; nats a unit of weight.
     """
 
-    intercepts: np.ndarray
-    slopes: np.ndarray
-    kernel_weights: np.ndarray
-    location: np.ndarray
-    scale: np.ndarray
-    centres: np.ndarray
-    bandwidths: np.ndarray
-    period: np.ndarray
-    bandwidth_factor: np.ndarray
-    prior_scale: np.ndarray
-    fits: np.ndarray
-    converged: np.ndarray
-    newton_decrement: np.ndarray
+    intercepts: Float[AnyArray, " a"]
+    slopes: Float[AnyArray, "a s"]
+    kernel_weights: Float[AnyArray, "a m"]
+    location: Float[AnyArray, " s"]
+    scale: Float[AnyArray, " s"]
+    centres: Float[AnyArray, "m s"]
+    bandwidths: Float[AnyArray, " s"]
+    period: Float[AnyArray, " s"]
+    bandwidth_factor: Float[AnyArray, ""]
+    prior_scale: Float[AnyArray, ""]
+    fits: Int[AnyArray, ""]
+    converged: Bool[AnyArray, ""]
+    newton_decrement: Float[AnyArray, ""]
 
     @classmethod
     def initial(
         cls,
-        observation_space: Space,
-        action_space: Space,
+        observation_space: Space[Any],
+        action_space: Space[Any],
         *,
         period: ArrayLike | None = None,
         number_of_centres: int = 50,
@@ -80,15 +85,11 @@ class SoftmaxPolicy:
           period: of each observation dimension, infinite where not periodic; None for none.
           number_of_centres: M.
           bandwidth_factor: of the median rule; the kernel's length scale.
-          prior_scale: prior standard deviation of a logit, in nats: what a penalty would be elsewhere.
+          prior_scale: prior standard deviation of a logit, in nats.
         """
         states = dimension("observation_space", observation_space)
         actions = number_of_values("action_space", action_space)
-        for name, value in (("bandwidth_factor", bandwidth_factor), ("prior_scale", prior_scale)):
-            if not (value > 0 and np.isfinite(value)):
-                raise ValueError(f"{name}: expected a finite number > 0, got {value}")
-        if number_of_centres < 1:
-            raise ValueError(f"number_of_centres: expected at least 1, got {number_of_centres}")
+        number_of_centres = whole("number_of_centres", number_of_centres)
         return cls(
             intercepts=np.zeros(actions),
             slopes=np.zeros((actions, states)),
@@ -98,34 +99,34 @@ class SoftmaxPolicy:
             centres=np.zeros((number_of_centres, states)),
             bandwidths=np.zeros(states),
             period=as_periods(period, states),
-            bandwidth_factor=np.asarray(float(bandwidth_factor)),
-            prior_scale=np.asarray(float(prior_scale)),
+            bandwidth_factor=np.asarray(positive("bandwidth_factor", bandwidth_factor)),
+            prior_scale=np.asarray(positive("prior_scale", prior_scale)),
             fits=np.asarray(0),
             converged=np.asarray(True),
             newton_decrement=np.asarray(0.0),
         )
 
-    def log_probabilities_at(self, observation: Any) -> Any:
-        """log π(·|s) at one observation, traceable; shape (A,)."""
-        kernel = radial_basis_row(observation, self.centres, self.bandwidths, self.period)
+    def log_probabilities_at(self, observation: Float[AnyArray, " s"]) -> Float[Array, " a"]:
+        """log π(·|s) at one observation, traceable."""
+        kernel = radial_basis_row(jnp.asarray(observation), self.centres, self.bandwidths, self.period)
         linear = jnp.asarray(self.slopes) @ ((observation - self.location) / self.scale)
         return jax.nn.log_softmax(self.intercepts + linear + jnp.asarray(self.kernel_weights) @ kernel)
 
-    def sample(self, key: jax.Array, observation: Any) -> Any:
-        """a ~ π(·|s), an integer scalar."""
+    def sample(self, key: Key[Array, ""], observation: Float[AnyArray, " s"]) -> Int[Array, ""]:
+        """a ~ π(·|s)."""
         return jax.random.categorical(key, self.log_probabilities_at(observation))
 
-    def log_prob(self, observation: Any, action: Any) -> Any:
+    def log_prob(self, observation: Float[AnyArray, " s"], action: Int[AnyArray, ""]) -> Float[Array, ""]:
         """log π(a|s)."""
         return self.log_probabilities_at(observation)[action]
 
-    def entropy(self, observation: Any) -> Any:
+    def entropy(self, observation: Float[AnyArray, " s"]) -> Float[Array, ""]:
         """Entropy of π(·|s) in nats."""
         logarithms = self.log_probabilities_at(observation)
         return -jnp.sum(jnp.exp(logarithms) * logarithms)
 
-    def probabilities(self, observations: np.ndarray) -> np.ndarray:
-        """π(·|sᵢ) for each observation, shape (N, A)."""
+    def probabilities(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
+        """π(·|sᵢ) for each of N observations."""
         observations = np.asarray(observations, dtype=np.float64)
         centres, period = np.asarray(self.centres), np.asarray(self.period)
         kernel = radial_basis(observations, centres, np.asarray(self.bandwidths), period)
@@ -133,19 +134,18 @@ class SoftmaxPolicy:
         logits = np.asarray(self.intercepts) + standardised @ np.asarray(self.slopes).T
         return np.exp(_log_softmax(logits + kernel @ np.asarray(self.kernel_weights).T))
 
-    def kl_divergence(self, old: Self, observations: np.ndarray) -> np.ndarray:
-        """KL(self ‖ old) at each observation, shape (N,)."""
+    def kl_divergence(self, old: Self, observations: ArrayLike) -> Float[np.ndarray, " n"]:
+        """KL(self ‖ old) at each of N observations."""
         return rel_entr(self.probabilities(observations), old.probabilities(observations)).sum(axis=1)
 
     def fit(
         self,
-        observations: np.ndarray,
-        actions: np.ndarray,
-        sample_weights: np.ndarray,
+        observations: ArrayLike,
+        actions: ArrayLike,
+        sample_weights: ArrayLike,
         *,
         rng: np.random.Generator,
-        base_weights: np.ndarray | None = None,
-        iterations: int = 50,
+        base_weights: ArrayLike | None = None,
     ) -> Self:
         """Maximum a posteriori of the weighted likelihood, at new centres, by Newton's method.
 
@@ -155,44 +155,28 @@ class SoftmaxPolicy:
           observations, actions: sᵢ (N, S) and integers aᵢ (N,). Rows that repeat a state, once for each action, cost as
             much as one.
           sample_weights, base_weights: wᵢ = pᵢ/Wᵢ and Wᵢ, shape (N,); see `Policy.fit`.
-          iterations: of Newton's method at most, O(N A²M²) each; `converged` says whether they sufficed.
         """
-        if iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {iterations}")
         number, dimensions = self.slopes.shape
-        samples = weighted_samples(
-            observations,
-            actions,
-            sample_weights,
-            base_weights,
-            observation_dimension=dimensions,
-            number_of_actions=number,
-        )
+        given = matrix("observations", observations, columns=dimensions)
+        samples = weighted_samples(given, indices("actions", actions, number), sample_weights, base_weights)
         states, mass = _by_state(samples, number)
         visits, period = mass.sum(axis=1), np.asarray(self.period)
-        shares = visits / visits.sum()
-        location = shares @ states
-        deviation = np.sqrt(shares @ np.square(states - location))
-        linear = (deviation > 1e-12 * (1 + np.abs(location))) & ~np.isfinite(period)
-        scale = np.where(linear, deviation, np.inf)
-
+        location, deviation = location_and_deviation(states, visits / visits.sum())
+        scale = np.where((deviation > 0) & ~np.isfinite(period), deviation, np.inf)
         bandwidths = median_bandwidths(states, factor=float(self.bandwidth_factor), period=period, rng=rng)
         points = coordinates(states, period) * inverse_bandwidths(bandwidths, period)
         rows = inducing_rows(points, visits, self.centres.shape[0], rng=rng)
+        # features whose independent weights have the process's prior: K_NM L⁻ᵀ
         back = inverse_factor(squared_exponential(points[rows], points[rows])).T
-        design = np.column_stack(
-            [np.ones(len(states)), (states - location) / scale, squared_exponential(points, points[rows]) @ back]
-        )
-        weights, newton_decrement, converged = _logistic_regression(
-            design, mass, prior_scale=float(self.prior_scale), iterations=iterations
-        )
+        kernel = squared_exponential(points, points[rows]) @ back
+        design = np.column_stack([np.ones(len(states)), (states - location) / scale, kernel])
+        weights, newton_decrement, converged = _logistic_regression(design, mass, float(self.prior_scale))
         missing = self.centres.shape[0] - len(rows)
-        kernel_weights = weights[:, 1 + dimensions :] @ back.T
         return replace(
             self,
             intercepts=weights[:, 0],
             slopes=weights[:, 1 : 1 + dimensions],
-            kernel_weights=np.pad(kernel_weights, ((0, 0), (0, missing))),
+            kernel_weights=np.pad(weights[:, 1 + dimensions :] @ back.T, ((0, 0), (0, missing))),
             location=location,
             scale=scale,
             centres=np.pad(states[rows], ((0, missing), (0, 0)), mode="edge"),
@@ -203,8 +187,10 @@ class SoftmaxPolicy:
         )
 
 
-def _by_state(samples: WeightedSamples, number_of_actions: int) -> tuple[np.ndarray, np.ndarray]:
-    """The different states (N', S) and the weight of each action in each of them (N', A)."""
+def _by_state(
+    samples: WeightedSamples, number_of_actions: int
+) -> tuple[Float[np.ndarray, "n s"], Float[np.ndarray, "n a"]]:
+    """The different states and the weight of each action in each of them."""
     states, index = np.unique(samples.observations, axis=0, return_inverse=True)
     cells = index.reshape(-1) * number_of_actions + samples.actions
     mass = np.bincount(cells, weights=samples.weights, minlength=len(states) * number_of_actions)
@@ -212,9 +198,9 @@ def _by_state(samples: WeightedSamples, number_of_actions: int) -> tuple[np.ndar
 
 
 def _logistic_regression(
-    design: np.ndarray, mass: np.ndarray, *, prior_scale: float, iterations: int
-) -> tuple[np.ndarray, float, bool]:
-    """argmax Σₙₐ massₙₐ log softmax(designₙ · weightsᵀ)ₐ − |weights|²/(2 prior_scale²); shape (A, D), and how well.
+    design: Float[np.ndarray, "n d"], mass: Float[np.ndarray, "n a"], prior_scale: float
+) -> tuple[Float[np.ndarray, "a d"], float, bool]:
+    """argmax Σₙₐ massₙₐ log softmax(designₙ · weightsᵀ)ₐ − |weights|²/(2 prior_scale²); last decrement, convergence.
 
     Newton's method with a halved step where the full one does not descend; the loss is strictly convex.
     """
@@ -223,13 +209,14 @@ def _logistic_regression(
     shares = mass / mass.sum()
     visits = shares.sum(axis=1)
 
-    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
+    def loss(weights: Float[np.ndarray, "a d"]) -> tuple[float, Float[np.ndarray, "n a"]]:
         logarithms = _log_softmax(design @ weights.T)
-        return 0.5 * precision * np.vdot(weights, weights) - np.vdot(shares, logarithms), np.exp(logarithms)
+        penalty = 0.5 * precision * np.vdot(weights, weights)
+        return penalty - np.vdot(shares, logarithms), np.exp(logarithms)  # eq. 14, and the prior
 
     weights = np.zeros((actions, size))
     value, probabilities = loss(weights)
-    for _ in range(iterations):
+    for _ in range(NEWTON_STEPS):
         gradient = (visits[:, None] * probabilities - shares).T @ design + precision * weights
         hessian = _hessian(design, visits, probabilities) + precision * np.eye(actions * size)
         step = np.linalg.solve(hessian, gradient.ravel()).reshape(weights.shape)
@@ -246,8 +233,10 @@ def _logistic_regression(
     return weights, decrement, False
 
 
-def _hessian(design: np.ndarray, visits: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
-    """Second derivative of −Σ share · log softmax, blocks Σₙ visits p_a(1[a = b] − p_b) xxᵀ; shape (AD, AD)."""
+def _hessian(
+    design: Float[np.ndarray, "n d"], visits: Float[np.ndarray, " n"], probabilities: Float[np.ndarray, "n a"]
+) -> Float[np.ndarray, "a*d a*d"]:
+    """Second derivative of −Σ share · log softmax, blocks Σₙ visits p_a(1[a = b] − p_b) xxᵀ."""
     actions, size = probabilities.shape[1], design.shape[1]
     hessian = np.empty((actions, size, actions, size))
     for a in range(actions):
@@ -258,6 +247,6 @@ def _hessian(design: np.ndarray, visits: np.ndarray, probabilities: np.ndarray) 
     return hessian.reshape(actions * size, actions * size)
 
 
-def _log_softmax(logits: np.ndarray) -> np.ndarray:
+def _log_softmax(logits: Float[np.ndarray, "n a"]) -> Float[np.ndarray, "n a"]:
     shifted = logits - logits.max(axis=1, keepdims=True)
     return shifted - np.log(np.exp(shifted).sum(axis=1, keepdims=True))

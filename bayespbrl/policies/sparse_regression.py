@@ -1,22 +1,24 @@
-"""Weighted sparse Gaussian process regression (specification, section 8): FITC with the noise σ²/wᵢ a sample.
+"""Weighted sparse Gaussian process regression: FITC with the noise σ²/wᵢ a sample.
 
-Snelson and Ghahramani (2006) for the inducing points, Kober et al. (2010) for the weights. Everything is written in
-v(x) = L⁻¹r(x), with r = k/s² the correlations of x with the M inducing points, s² the signal variance and LLᵀ = R_M:
+FITC: Snelson and Ghahramani (2006), Sparse Gaussian processes using pseudo-inputs. Weights: Kober, Oztop and Peters
+(2010), Reinforcement learning to adjust robot movements to new situations. Everything is written in v(x) = L⁻¹r(x),
+with r = k/s² the correlations of x with the M inducing points, s² the signal variance and LLᵀ = R_M:
 
   Λᵢᵢ = s²(1 − |vᵢ|²) + σ²/wᵢ ;  B/s² = L(I + s² VΛ⁻¹Vᵀ)Lᵀ ;  mean = s² vᵀ(I + s² VΛ⁻¹Vᵀ)⁻¹VΛ⁻¹y
 
 which inverts nothing worse conditioned than L, and needs no sample's noise to be finite (wᵢ = 0 drops out). Only
-NumPy's linear algebra is used: SciPy brings a second BLAS, and the idle threads of the two get in each other's way,
-which costs small matrices a factor of three to twenty.
+NumPy's linear algebra is used: SciPy brings a second BLAS, whose idle threads slow small matrices down.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from bayespbrl.kernels import squared_exponential
 
 JITTER = 1e-8  # relative to the signal variance; the kernel's rounding errors are near 1e-14
+CANDIDATES = 2000  # rows among which the inducing points are chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,32 +26,38 @@ class SparseRegression:
     """The posterior of one output at any x, from the correlations r(x) with the inducing points.
 
     Attributes:
-      mean_weights: mean(x) = r(x)ᵀ mean_weights; shape (M,).
-      reduction: var(x) = s²(1 − |reduction · r(x)|²) + σ², and the norm stays below one; shape (M, M).
+      mean_weights: mean(x) = r(x)ᵀ mean_weights.
+      reduction: var(x) = s²(1 − |reduction · r(x)|²) + σ², and the norm stays below one.
     """
 
-    mean_weights: np.ndarray
-    reduction: np.ndarray
+    mean_weights: Float[np.ndarray, " m"]
+    reduction: Float[np.ndarray, "m m"]
 
 
-def whitened_correlations(correlations: np.ndarray, inducing_correlations: np.ndarray) -> np.ndarray:
-    """V = L⁻¹R_MN for correlations (M, N) of inducing points with samples; shape (M, N), columns of norm ≤ 1."""
+def whitened_correlations(
+    correlations: Float[np.ndarray, "m n"], inducing_correlations: Float[np.ndarray, "m m"]
+) -> Float[np.ndarray, "m n"]:
+    """V = L⁻¹R_MN from the correlations of inducing points with samples; columns of norm ≤ 1."""
     return inverse_factor(inducing_correlations) @ correlations
 
 
 def precisions(
-    whitened: np.ndarray, weights: np.ndarray, *, signal_variance: float, noise_variance: float
-) -> np.ndarray:
-    """Λ⁻¹, as w/(w s²(1 − |v|²) + σ²); shape (N,)."""
+    whitened: Float[np.ndarray, "m n"],
+    weights: Float[np.ndarray, " n"],
+    *,
+    signal_variance: float,
+    noise_variance: float,
+) -> Float[np.ndarray, " n"]:
+    """Λ⁻¹ (Snelson and Ghahramani 2006) with the noise σ²/w (Kober et al. 2010), as w/(w s²(1 − |v|²) + σ²)."""
     unexplained = np.maximum(1.0 - np.einsum("mn,mn->n", whitened, whitened), 0.0)
     return weights / (weights * (signal_variance * unexplained) + noise_variance)
 
 
 def fit_sparse_regression(
-    correlations: np.ndarray,
-    inducing_correlations: np.ndarray,
-    targets: np.ndarray,
-    weights: np.ndarray,
+    correlations: Float[np.ndarray, "m n"],
+    inducing_correlations: Float[np.ndarray, "m m"],
+    targets: Float[np.ndarray, " n"],
+    weights: Float[np.ndarray, " n"],
     *,
     signal_variance: float,
     noise_variance: float,
@@ -57,41 +65,42 @@ def fit_sparse_regression(
     """FITC posterior for a prior of mean zero. Cost O(NM²).
 
     Args:
-      correlations: r(zₘ, xᵢ), shape (M, N).
-      inducing_correlations: r(zₘ, zₙ), shape (M, M).
-      targets, weights: yᵢ and wᵢ ≥ 0 (a weight of two counts as two samples where Z is the data), shape (N,).
+      correlations: r(zₘ, xᵢ).
+      inducing_correlations: r(zₘ, zₙ).
+      targets, weights: yᵢ and wᵢ ≥ 0; a weight of two counts as two samples where Z is the data.
       signal_variance, noise_variance: s² and σ², > 0, in the square of the target's units.
     """
     inverse_lower = inverse_factor(inducing_correlations)
     whitened = inverse_lower @ correlations
     precision = precisions(whitened, weights, signal_variance=signal_variance, noise_variance=noise_variance)
     scaled = whitened * precision
-    information, rotation = np.linalg.eigh(signal_variance * (scaled @ whitened.T))
+    information, rotation = np.linalg.eigh(signal_variance * (scaled @ whitened.T))  # UλUᵀ = s² VΛ⁻¹Vᵀ
     information = np.maximum(information, 0.0)
     back = inverse_lower.T @ rotation  # L⁻ᵀU
     projected = rotation.T @ (scaled @ targets)
+    # Snelson and Ghahramani (2006), predictive mean: B⁻¹K_MN Λ⁻¹y
     mean_weights = signal_variance * (back @ (projected / (1.0 + information)))
-    # K_M⁻¹ − B⁻¹ = L⁻ᵀ(I − (I + UλUᵀ)⁻¹)L⁻¹/s² as one square: the variance cannot come out negative
+    # Snelson and Ghahramani (2006), predictive variance: K_M⁻¹ − B⁻¹ = L⁻ᵀ(I − (I + UλUᵀ)⁻¹)L⁻¹/s², written as a
+    # square, so that the variance cannot come out negative
     reduction = np.sqrt(information / (1.0 + information))[:, None] * back.T
     return SparseRegression(mean_weights, reduction)
 
 
 def inducing_rows(
-    points: np.ndarray, weights: np.ndarray, number: int, *, rng: np.random.Generator, candidates: int = 2000
-) -> np.ndarray:
+    points: Float[np.ndarray, "n e"], weights: Float[np.ndarray, " n"], number: int, *, rng: np.random.Generator
+) -> Int[np.ndarray, " m"]:
     """Rows of `points` to induce from: where the weight lies, and no two where one would do.
 
     Randomly pivoted Cholesky (Chen, Epperly, Tropp and Webber 2023): each next row is drawn in proportion to the prior
-    variance that the rows before it leave unexplained, among `candidates` rows drawn in proportion to their weight.
-    Weighted random rows spend their points twice over in dense regions; a greedy choice spends them on outliers.
+    variance that the rows before it leave unexplained, among `CANDIDATES` rows drawn in proportion to their weight.
 
     Args:
-      points: scaled kernel coordinates, shape (N, E).
-      weights: > 0, shape (N,).
+      points: scaled kernel coordinates.
+      weights: > 0.
       number: M; fewer rows come back where they already explain every candidate.
     """
     keys = np.log(weights) + rng.gumbel(size=len(weights))  # the largest keys: a draw by weight without replacement
-    size = min(candidates, len(points))
+    size = min(CANDIDATES, len(points))
     chosen = np.sort(np.argpartition(-keys, size - 1)[:size])
     pool = points[chosen]
     unexplained = np.ones(size)
@@ -114,7 +123,7 @@ def inducing_rows(
     return chosen[pivots]
 
 
-def inverse_factor(inducing_correlations: np.ndarray) -> np.ndarray:
+def inverse_factor(inducing_correlations: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "m m"]:
     """L⁻¹ with LLᵀ = R_M + jitter; the jitter bounds the condition of L by about 1e5."""
     jittered = inducing_correlations + JITTER * np.eye(len(inducing_correlations))
     return np.linalg.inv(np.linalg.cholesky(jittered))
