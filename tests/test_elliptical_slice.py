@@ -194,7 +194,7 @@ def test_a_kernel_that_shrinks_to_the_wrong_side_is_rejected(monkeypatch):
 
 
 def test_a_kernel_that_uses_a_key_twice_is_rejected(monkeypatch):
-    from bayespbrl.models import elliptical_slice
+    from bayespbrl.models import elliptical_slice, elliptical_slice_kernel
 
     class Reused:
         def __getattr__(self, name):
@@ -203,7 +203,8 @@ def test_a_kernel_that_uses_a_key_twice_is_rejected(monkeypatch):
         def split(self, key, number=2):
             return jnp.stack([key] * number)
 
-    monkeypatch.setattr(elliptical_slice, "random", Reused())
+    for module in (elliptical_slice, elliptical_slice_kernel):
+        monkeypatch.setattr(module, "random", Reused())
     assert p_value_after_moves(EllipticalSlice(preference_model)) < 1e-6
 
 

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
+from bayespbrl.models import PreferenceModel
 from bayespbrl.models.expectation_propagation import expectation_propagation, tilted_moments
 from bayespbrl.models.likelihoods import (
     Logistic,
@@ -11,7 +12,6 @@ from bayespbrl.models.likelihoods import (
     WithLapses,
     WithTies,
     log_prob,
-    preference_likelihood,
 )
 
 LIKELIHOODS = [Mixed(5.0, 3.0), Mixed(200.0, 41.0), Mixed(0.01, 2.0), Logistic(3.0), WithLapses(Mixed(5.0, 3.0), 0.2)]
@@ -93,9 +93,7 @@ def test_answers_that_contradict_each_other_about_nearly_the_same_margin_do_not_
 @pytest.mark.parametrize(("steepness", "lapse_rate"), [(5.0, 0.0), (1.0, 0.0), (5.0, 0.1)])
 def test_answers_about_one_margin_are_one_factor_and_so_exact(first, second, steepness, lapse_rate):
     ratios = np.where(np.arange(first + second) % 3, 1.0, 0.2) * np.repeat([1.0, -1.0], [first, second])
-    likelihood = preference_likelihood(
-        "mixed", steepness=steepness, number_of_preferences=len(ratios), lapse_rate=lapse_rate
-    )
+    likelihood = PreferenceModel(steepness=steepness, lapse_rate=lapse_rate).answer_likelihood(len(ratios))
     loadings = ratios[:, None] * [0.6, 0.8]
     fit = expectation_propagation(loadings, likelihood.probit_mixture(), prior_scale=1.0)
     t = np.linspace(-8, 8, 200_000)  # none at the step, where it is one half

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from scipy.special import expit, log_ndtr, ndtr
 
+from bayespbrl.models import PreferenceModel
 from bayespbrl.models.likelihoods import (
     Likelihood,
     Logistic,
@@ -11,7 +12,6 @@ from bayespbrl.models.likelihoods import (
     WithLapses,
     WithTies,
     log_prob,
-    preference_likelihood,
     total_log_prob,
 )
 
@@ -101,13 +101,30 @@ def test_far_tails_are_finite_and_nan_stays_nan():
 
 def test_all_meet_the_protocol_and_bad_settings_are_named():
     assert all(isinstance(likelihood, Likelihood) for likelihood in ALL)
-    assert isinstance(preference_likelihood("mixed", steepness=1, number_of_preferences=3), Mixed)
     for settings, message in (
+        ({"prior_scale": 0.0}, "prior_scale"),
         ({"steepness": 0.0}, "steepness"),
         ({"steepness": np.nan}, "steepness"),
         ({"lapse_rate": 1.0}, "lapse_rate"),
         ({"lapse_rate": -0.1}, "lapse_rate"),
-        ({"name": "nonsense"}, "likelihood"),
+        ({"likelihood": "nonsense"}, "likelihood"),
+        ({"tie_threshold": 0.0}, "tie_threshold"),
     ):
-        with pytest.raises(ValueError, match=message):
-            preference_likelihood(**{"name": "mixed", "steepness": 1.0, "number_of_preferences": 1, **settings})
+        with pytest.raises(ValueError, match=f"^{message}: expected"):
+            PreferenceModel(**settings)
+
+
+def test_a_preference_model_names_its_likelihood():
+    tied = np.array([True, False])
+    assert PreferenceModel(steepness=3).answer_likelihood(2) == Mixed(3.0, 2.0)
+    assert PreferenceModel().answer_likelihood(0) == Mixed(5.0, 1.0)
+    assert PreferenceModel(likelihood="logistic").answer_likelihood(2, np.zeros(2, dtype=bool)) == Logistic(5.0)
+    lapsing = PreferenceModel(likelihood="probit", lapse_rate=0.1, tie_threshold=0.2)
+    with_ties = lapsing.answer_likelihood(2, tied)
+    assert (with_ties.ordered, with_ties.threshold) == (WithLapses(Probit(5.0), 0.1), 0.2)
+    np.testing.assert_array_equal(with_ties.indifferent, tied)
+    np.testing.assert_array_equal(lapsing.answer_likelihood(3).indifferent, np.zeros(3, dtype=bool))
+    with pytest.raises(ValueError, match="tie_threshold: expected a number > 0"):
+        PreferenceModel().answer_likelihood(2, tied)
+    with pytest.raises(ValueError, match="indifferent: expected a vector of bool"):
+        lapsing.answer_likelihood(2, np.zeros(2))

@@ -8,19 +8,20 @@ from scipy.special import logsumexp
 
 from bayespbrl.models import (
     Candidate,
+    EllipticalSlice,
     HyperparameterSearch,
     PreferenceModel,
-    posterior,
+    fit_gaussian,
     restored,
     sample_posterior,
     search_hyperparameters,
     stored,
 )
+from bayespbrl.models.chains import KERNEL, Chains, _ellipses, draw_chunk
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.likelihoods import Mixed, log_prob
 from bayespbrl.models.low_rank import low_rank
-from bayespbrl.models.posterior import _ellipses, _run, fit_gaussian
-from bayespbrl.models.preference_model import low_rank_model, padded_problem
+from bayespbrl.models.preference_problem import low_rank_model, padded_problem
 
 
 def consistent(number, dimension, seed=0):
@@ -205,7 +206,7 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
             mean=np.arange(6.0),
             site_precisions=1 + np.arange(6.0),
         )
-        kernel = posterior.EllipticalSlice(low_rank_model)
+        kernel = EllipticalSlice(low_rank_model)
         z = np.random.default_rng(0).standard_normal((20, len(problem.centre)))
         joint = np.array([sum(kernel._log_probs({"utility_weights": x}, (problem,), {})) for x in z])
         likelihood = np.array([kernel._log_probs({"utility_weights": x}, (problem,), {})[1] for x in z])
@@ -222,9 +223,9 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
 def test_numpyros_mcmc_gives_the_same_draws_as_the_compiled_loop():
     fit = fit_gaussian(consistent(6, 9), PreferenceModel())
     with jax.enable_x64(True):
-        chains = posterior._Chains.start(fit, num_chains=2, chunk=5, seed=0)
+        chains = Chains.start(fit, num_chains=2, chunk=5, seed=0)
         mcmc = MCMC(
-            posterior.KERNEL,
+            KERNEL,
             num_warmup=0,
             num_samples=5,
             num_chains=2,
@@ -242,12 +243,12 @@ def test_chains_started_in_the_far_tail_forget_it():
     differences = consistent(20, 40)
     fit = fit_gaussian(differences, PreferenceModel())
     with jax.enable_x64(True):
-        chains = posterior._Chains.start(fit, num_chains=4, chunk=100, seed=0)
+        chains = Chains.start(fit, num_chains=4, chunk=100, seed=0)
         far = {
             "utility_weights": np.asarray(chains.state.z["utility_weights"]) * 0 + np.array([[30], [-30], [8], [-8]])
         }
-        state, _, _ = _run(chains.state._replace(z=far), chains.problem, length=100)
-        _, states, _ = _run(state, chains.problem, length=1000)
+        state, _, _ = draw_chunk(chains.state._replace(z=far), chains.problem, length=100)
+        _, states, _ = draw_chunk(state, chains.problem, length=1000)
     margins = np.asarray(states.z["utility_weights"])[:, :, :20] @ fit.factors.loadings.T
     expected = sample_posterior(differences, num_samples=4000)["posterior/margins"].values
     error = np.hypot(chain_convergence(margins).monte_carlo_error, chain_convergence(expected).monte_carlo_error)
@@ -257,11 +258,11 @@ def test_chains_started_in_the_far_tail_forget_it():
 
 @pytest.mark.slow
 def test_forty_iterations_compile_the_sampler_at_most_five_times():
-    before = _run._cache_size()
+    before = draw_chunk._cache_size()
     differences = consistent(41, 60)
     for number in range(2, 42):
         sample_posterior(differences[:number], num_samples=100, max_samples=100, num_warmup=0)
-    assert _run._cache_size() - before <= 5
+    assert draw_chunk._cache_size() - before <= 5
 
 
 @pytest.mark.slow

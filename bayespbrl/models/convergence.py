@@ -1,17 +1,20 @@
-"""Convergence of Markov chains: R̂, effective sample size and Monte Carlo error by ArviZ, arrays in (paper, step 1).
+"""Convergence of Markov chains: R̂, effective sample size and Monte Carlo error, by ArviZ on arrays.
 
 The rank-normalised R̂ and bulk effective sample size are those of Vehtari et al. (2021).
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from arviz_stats.base import array_stats
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """What the draws of each quantity are worth; each shape (...) as the quantities.
+    """R̂, effective sample size and Monte Carlo error of each quantity.
 
     A quantity that is the same number in every draw has R̂ 1, as many effective draws as draws, and no error.
 
@@ -21,9 +24,9 @@ class Convergence:
       monte_carlo_error: standard error of the mean.
     """
 
-    rhat: np.ndarray
-    effective_sample_size: np.ndarray
-    monte_carlo_error: np.ndarray
+    rhat: Float[np.ndarray, "*quantities"]
+    effective_sample_size: Float[np.ndarray, "*quantities"]
+    monte_carlo_error: Float[np.ndarray, "*quantities"]
 
     @property
     def rhat_max(self) -> float:
@@ -40,11 +43,11 @@ class Convergence:
         return self.rhat_max <= rhat_max and self.effective_sample_size_min >= effective_sample_size_min
 
 
-def chain_convergence(draws: np.ndarray) -> Convergence:
-    """Diagnose `draws`, shape (chain, draw, ...), at least two chains or four draws.
+def chain_convergence(draws: ArrayLike) -> Convergence:
+    """Diagnose `draws` of shape (chain, draw, *quantities).
 
     Raises:
-      ValueError: fewer than two dimensions.
+      ValueError: fewer than two dimensions or four draws.
     """
     draws = np.asarray(draws, dtype=float)
     if draws.ndim < 2 or draws.shape[1] < 4:
@@ -56,9 +59,10 @@ def chain_convergence(draws: np.ndarray) -> Convergence:
     # a NaN is not constant: it must reach the diagnostics and fail there
     varies = ~np.all(flat == flat[:1, :1], axis=(0, 1))
     if varies.any():
+        statistics: Any = array_stats  # untyped
         axes = {"chain_axis": 0, "draw_axis": 1}
-        rhat[varies] = array_stats.rhat(flat[:, :, varies], **axes)
-        size[varies] = array_stats.ess(flat[:, :, varies], method="bulk", **axes)
-        error[varies] = array_stats.mcse(flat[:, :, varies], method="mean", **axes)
+        rhat[varies] = statistics.rhat(flat[:, :, varies], **axes)
+        size[varies] = statistics.ess(flat[:, :, varies], method="bulk", **axes)
+        error[varies] = statistics.mcse(flat[:, :, varies], method="mean", **axes)
     shape = draws.shape[2:]
     return Convergence(rhat.reshape(shape), size.reshape(shape), error.reshape(shape))

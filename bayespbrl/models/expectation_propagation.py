@@ -9,16 +9,20 @@ and four against a margin those of the four alone may be left.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.special import log_ndtr, ndtr
 
 from bayespbrl.models.likelihoods import ProbitMixture
 
+MAX_SWEEPS = 200  # updates of all factors
+DAMPING = 0.85  # share of each update that is taken, in (0, 1]; reduced whenever the changes grow
+TOLERANCE = 1e-6  # change of the margins' moments, in standard deviations, that counts as none
 # Prior variance of a margin over that of its site, beyond which the site is taken for a runaway. A step has no scale:
-# answers that contradict each other about nearly the same margin each cut a part off whatever the others leave, and
-# their sites grow by a factor at every sweep, until the linear algebra breaks down near 1e16. Sites that settle stay
-# far below: 1e5 with 320 random answers about nearly the same margins.
+# answers that contradict each other about nearly the same margin each cut a part off whatever the others leave. Their
+# sites grow by a factor at every sweep, until the linear algebra breaks down near 1e16.
 RUNAWAY = 1e12
 SAME = 1e-10  # of the cosine between two rows of L, below 1, where they are about the same margin
 # Panels on which one factor of several answers is integrated: to where the Gaussian ends, in its standard deviations,
@@ -32,32 +36,47 @@ class GaussianApproximation:
     """N(mean, covariance) in r dimensions, as expectation propagation left it.
 
     Attributes:
-      mean: shape (r,).
-      covariance: shape (r, r).
-      site_precisions, site_shifts: the factors exp(−τ t²/2 + ν t) that stand for the answers, shapes (K,); of several
-        about the same margin the first has the factor of all. Zero where there is none, because the answer is
-        contradicted by others about nearly the same margin.
-      log_evidence: expectation propagation's log ∫ p(answers | z) p(z) dz.
-      sweeps: updates of all factors that were done.
+      mean, covariance: of z.
+      site_precisions: τ of the factors exp(−τ t²/2 + ν t) that stand for the answers. Of several answers about the same
+        margin the first has the factor of all. Zero where there is none, because the answer is contradicted by others
+        about nearly the same margin.
+      log_evidence: the estimate of log ∫ p(answers | z) p(z) dz, nats.
       converged: whether the last update changed the margins' means and standard deviations by less than the tolerance,
         and every answer has a part in a factor.
     """
 
-    mean: np.ndarray
-    covariance: np.ndarray
-    site_precisions: np.ndarray
-    site_shifts: np.ndarray
+    mean: Float[np.ndarray, " r"]
+    covariance: Float[np.ndarray, "r r"]
+    site_precisions: Float[np.ndarray, " k"]
     log_evidence: float
-    sweeps: int
     converged: bool
 
 
+class _Gaussian(NamedTuple):
+    """Moments of z and of the margins t, and log ∫ N(z; 0, σ²I) Π exp(−τ t²/2 + ν t) dz."""
+
+    mean: Float[np.ndarray, " r"]
+    covariance: Float[np.ndarray, "r r"]
+    t_mean: Float[np.ndarray, " k"]
+    t_variance: Float[np.ndarray, " k"]
+    log_normaliser: float
+
+
+class _Sites(NamedTuple):
+    """The factors exp(−τ t²/2 + ν t)."""
+
+    precisions: Float[np.ndarray, " k"]
+    shifts: Float[np.ndarray, " k"]
+
+
 def tilted_moments(
-    means: np.ndarray, variances: np.ndarray, mixture: ProbitMixture
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    means: Float[np.ndarray, " k"], variances: Float[np.ndarray, " k"], mixture: ProbitMixture
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """log Z, mean and variance of N(t; mean, variance) p(t) / Z for each of K margins, in closed form.
 
     Z(μ) = c + Σⱼ aⱼ Φ(xⱼ), xⱼ = (μ − oⱼ)/√(s² + hⱼ²); the moments are its first two derivatives in μ.
+
+    Source: Rasmussen & Williams (2006), section 3.9, for one probit.
     """
     spread = np.sqrt(variances[:, None] + mixture.scales**2)
     x = (means[:, None] - mixture.offsets) / spread
@@ -75,11 +94,11 @@ def tilted_moments(
 
 
 def repeated_moments(
-    mean: float, variance: float, ratios: np.ndarray, mixture: ProbitMixture
+    mean: float, variance: float, ratios: Float[np.ndarray, " n"], mixture: ProbitMixture
 ) -> tuple[float, float, float]:
     """log Z, mean and variance of N(t; mean, variance) Πₖ pₖ(ratiosₖ t) / Z by quadrature: n answers about one margin.
 
-    `mixture` is of the n answers.
+    Gauss-Legendre on panels that end where a factor has a kink. `mixture` is of the n answers.
     """
     deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
     offsets = np.unique(mixture.offsets / ratios[:, None])
@@ -108,7 +127,9 @@ def repeated_moments(
     return float(top + np.log(z)), float(tilted), float(density @ (t - tilted) ** 2 / z)
 
 
-def _same_margins(loadings: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _same_margins(
+    loadings: Float[np.ndarray, "k r"],
+) -> list[tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]]:
     """The rows of L in groups that are parallel, in the order of the first of each, and their ratios to it."""
     tiny = np.finfo(float).tiny
     largest = np.maximum(np.max(np.abs(loadings), axis=1, initial=0.0, keepdims=True), tiny)
@@ -130,7 +151,7 @@ def _same_margins(loadings: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 class _Factors:
     """The likelihood as a function of one margin for each of G groups of answers."""
 
-    def __init__(self, loadings: np.ndarray, mixture: ProbitMixture):
+    def __init__(self, loadings: Float[np.ndarray, "k r"], mixture: ProbitMixture) -> None:
         groups = _same_margins(loadings)
         self.first = np.array([group[0] for group, _ in groups], dtype=int)
         self.single = np.array([len(group) == 1 for group, _ in groups], dtype=bool)
@@ -139,7 +160,9 @@ class _Factors:
             (number, ratios, mixture.of(group)) for number, (group, ratios) in enumerate(groups) if len(group) > 1
         ]
 
-    def moments(self, means: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def moments(
+        self, means: Float[np.ndarray, " g"], variances: Float[np.ndarray, " g"]
+    ) -> tuple[Float[np.ndarray, " g"], Float[np.ndarray, " g"], Float[np.ndarray, " g"]]:
         """`tilted_moments` of each group's margin, that of its first answer."""
         log_z, tilted, narrowed = tilted_moments(means, variances, self.mixture)
         for number, ratios, mixture in self.repeated:
@@ -150,86 +173,82 @@ class _Factors:
 
 
 def expectation_propagation(
-    loadings: np.ndarray,
-    mixture: ProbitMixture,
-    *,
-    prior_scale: float,
-    max_sweeps: int = 200,
-    damping: float = 0.85,
-    tolerance: float = 1e-6,
+    loadings: Float[np.ndarray, "k r"], mixture: ProbitMixture, *, prior_scale: float
 ) -> GaussianApproximation:
     """Fit the posterior of z ~ N(0, σ²I_r) given answers to the margins t = L z.
 
     Args:
-      loadings: L, shape (K, r).
+      loadings: L.
       mixture: the answers' likelihood.
       prior_scale: σ > 0.
-      max_sweeps: cap on the updates of all factors.
-      damping: share of each update that is taken, in (0, 1]; reduced whenever the changes grow.
-      tolerance: change of the margins' moments, in standard deviations, that counts as none.
     """
     factors, answers = _Factors(loadings, mixture), len(loadings)
     loadings = loadings[factors.first]
     number = len(loadings)
-    precisions, shifts = np.zeros(number), np.zeros(number)
-    gaussian = prior = _moments(loadings, precisions, shifts, prior_scale)
-    converged, sweeps, last, first_damping = False, 0, np.inf, damping
+    sites = none = _Sites(np.zeros(number), np.zeros(number))
+    gaussian = prior = _moments(loadings, sites, prior_scale)
+    converged, sweeps, last, damping = False, 0, np.inf, DAMPING
     held = np.zeros(number, dtype=bool)
-    while sweeps < max_sweeps and not converged and number:
+    while sweeps < MAX_SWEEPS and not converged and number:
         sweeps += 1
-        _, _, t_mean, t_variance, _ = gaussian
-        cavity = 1 / np.maximum(1 - t_variance * precisions, 1e-10)
-        cavity_variance = t_variance * cavity
-        cavity_mean = (t_mean - t_variance * shifts) * cavity
-        _, mean, variance = factors.moments(cavity_mean, cavity_variance)
-        # a violated answer's factor can widen its margin: its precision is held at 0, its shift keeps the tilted mean
-        new_precisions = np.maximum(1 / variance - 1 / cavity_variance, 0.0)
-        new_shifts = mean * (new_precisions + 1 / cavity_variance) - cavity_mean / cavity_variance
-        narrowed = np.where(factors.single, new_precisions * prior[3], 0.0)  # one factor of several cannot run
+        matched = _matched_sites(factors, gaussian, sites)
+        narrowed = np.where(factors.single, matched.precisions * prior.t_variance, 0.0)  # of several none can run away
         if np.any(narrowed[~held] > RUNAWAY):
             held |= narrowed > 0.01 * RUNAWAY
-            precisions, shifts, gaussian = np.zeros(number), np.zeros(number), prior
-            damping, last = first_damping, np.inf
+            sites, gaussian, damping, last = none, prior, DAMPING, np.inf
             continue
-        new_precisions[held] = new_shifts[held] = 0.0
-        precisions = precisions + damping * (new_precisions - precisions)
-        shifts = shifts + damping * (new_shifts - shifts)
-        gaussian = _moments(loadings, precisions, shifts, prior_scale)
-        moved = np.abs(gaussian[2] - t_mean) + np.abs(np.sqrt(gaussian[3]) - np.sqrt(t_variance))
-        change = float(np.max(moved / np.sqrt(t_variance)))
-        converged = change <= tolerance
+        matched.precisions[held] = matched.shifts[held] = 0.0
+        sites = _Sites(*(old + damping * (new - old) for old, new in zip(sites, matched, strict=True)))
+        before, gaussian = gaussian, _moments(loadings, sites, prior_scale)
+        moved = np.abs(gaussian.t_mean - before.t_mean)
+        moved += np.abs(np.sqrt(gaussian.t_variance) - np.sqrt(before.t_variance))
+        change = float(np.max(moved / np.sqrt(before.t_variance)))
+        converged = change <= TOLERANCE
         damping, last = (0.8 * damping if change > last else damping), change
-    mean, covariance, *_ = gaussian
-    evidence = _log_evidence(gaussian, precisions, shifts, factors) if number else 0.0
-    site_precisions, site_shifts = np.zeros((2, answers))
-    site_precisions[factors.first], site_shifts[factors.first] = precisions, shifts
-    converged = not number or (converged and not held.any())
-    return GaussianApproximation(mean, covariance, site_precisions, site_shifts, evidence, sweeps, converged)
+    evidence = _log_evidence(gaussian, sites, factors) if number else 0.0
+    site_precisions = np.zeros(answers)
+    site_precisions[factors.first] = sites.precisions
+    converged = not number or (converged and not bool(held.any()))
+    return GaussianApproximation(gaussian.mean, gaussian.covariance, site_precisions, evidence, converged)
 
 
-def _moments(loadings, precisions, shifts, prior_scale):
-    """Mean and covariance of z, mean and variance of t, and log ∫ N(z; 0, σ²I) Π exp(−τ t²/2 + ν t) dz."""
+def _cavity(gaussian: _Gaussian, sites: _Sites) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Mean and variance of each margin without its own site (Rasmussen & Williams 2006, eq. 3.56)."""
+    cavity = 1 / np.maximum(1 - gaussian.t_variance * sites.precisions, 1e-10)
+    return (gaussian.t_mean - gaussian.t_variance * sites.shifts) * cavity, gaussian.t_variance * cavity
+
+
+def _matched_sites(factors: _Factors, gaussian: _Gaussian, sites: _Sites) -> _Sites:
+    """The sites whose product with the cavities has the tilted moments (Rasmussen & Williams 2006, eq. 3.59)."""
+    cavity_mean, cavity_variance = _cavity(gaussian, sites)
+    _, mean, variance = factors.moments(cavity_mean, cavity_variance)
+    # a violated answer's factor can widen its margin: its precision is held at 0, its shift keeps the tilted mean
+    precisions = np.maximum(1 / variance - 1 / cavity_variance, 0.0)
+    return _Sites(precisions, mean * (precisions + 1 / cavity_variance) - cavity_mean / cavity_variance)
+
+
+def _moments(loadings: Float[np.ndarray, "k r"], sites: _Sites, prior_scale: float) -> _Gaussian:
+    """The prior times the sites (Rasmussen & Williams 2006, eq. 3.53)."""
     rank = loadings.shape[1]
     # scaled by σ, the precision is at least the identity: always well conditioned enough for Cholesky
     scaled = prior_scale * loadings
-    factor = np.linalg.cholesky(np.eye(rank) + (scaled.T * precisions) @ scaled)
+    factor = np.linalg.cholesky(np.eye(rank) + (scaled.T * sites.precisions) @ scaled)
     # one small general inverse: threaded triangular solves cost ten times as much where other threads are busy
     inverse = np.linalg.inv(factor)
     half = inverse @ scaled.T
-    direction = half @ shifts
+    direction = half @ sites.shifts
     mean = prior_scale * inverse.T @ direction
     covariance = prior_scale**2 * inverse.T @ inverse
     log_normaliser = 0.5 * direction @ direction - np.sum(np.log(np.diag(factor)))
-    return mean, covariance, half.T @ direction, np.sum(half**2, axis=0), float(log_normaliser)
+    return _Gaussian(mean, covariance, half.T @ direction, np.sum(half**2, axis=0), float(log_normaliser))
 
 
-def _log_evidence(gaussian, precisions, shifts, factors):
+def _log_evidence(gaussian: _Gaussian, sites: _Sites, factors: _Factors) -> float:
     """Σ_k [log Z_k(cavity) − log ∫ cavity · site] + log ∫ prior · sites (Rasmussen & Williams 2006, eq. 3.65)."""
-    _, _, t_mean, t_variance, log_normaliser = gaussian
-    cavity = 1 / np.maximum(1 - t_variance * precisions, 1e-10)
-    variance, mean = t_variance * cavity, (t_mean - t_variance * shifts) * cavity
+    precisions, shifts = sites
+    mean, variance = _cavity(gaussian, sites)
     log_tilted, _, _ = factors.moments(mean, variance)
     grown = 1 + variance * precisions
     # ∫ N(t; mean, variance) exp(−τ t²/2 + ν t) dt
     log_site = -0.5 * np.log(grown) + (shifts * mean + 0.5 * variance * shifts**2 - 0.5 * precisions * mean**2) / grown
-    return float(np.sum(log_tilted - log_site) + log_normaliser)
+    return float(np.sum(log_tilted - log_site) + gaussian.log_normaliser)

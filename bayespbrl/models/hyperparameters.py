@@ -1,18 +1,21 @@
-"""Which length scale, prior scale and steepness the answers speak for: weights by their log marginal likelihood.
+"""Length scales, prior scale and steepness by marginal likelihood.
 
-Expectation propagation gives the log evidence log p(answers | candidate) for the price of one Gaussian fit.
+Expectation propagation estimates log p(answers | candidate) at the cost of one Gaussian fit.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import logsumexp
 
-from bayespbrl.models.posterior import GaussianFit, fit_gaussian
+from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian
 from bayespbrl.models.preference_model import PreferenceModel
 
-LEAST_GAIN = 1e-6  # nats; evidence that differs by rounding only says nothing
+LEAST_GAIN = 1e-6  # nats; smaller differences of the evidence are rounding
+ROUNDS = 2  # how often each axis is gone through at most
+Point = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -20,12 +23,11 @@ class Candidate:
     """One setting to be weighed.
 
     Attributes:
-      differences: ψ(preferred) − ψ(dominated), shape (K, D), D as this candidate's features have it; they carry its
-        length scales.
+      differences: ψ(preferred) − ψ(dominated) in this candidate's features, which carry its length scales.
       model: prior and likelihood.
     """
 
-    differences: np.ndarray
+    differences: Float[np.ndarray, "k d"]
     model: PreferenceModel
 
     def fit(self) -> GaussianFit:
@@ -38,61 +40,60 @@ class HyperparameterSearch:
     """A climb over a grid by the marginal likelihood.
 
     Attributes:
-      points: the settings that were examined, in their order, shape (C, axes).
-      log_evidence: log p(answers | setting) of each by expectation propagation, shape (C,).
+      points: the settings that were examined, in their order.
+      log_evidence: log p(answers | setting) of each by expectation propagation, nats.
       reached: index of the point where the climb ended.
     """
 
-    points: np.ndarray
-    log_evidence: np.ndarray
+    points: Float[np.ndarray, "c axes"]
+    log_evidence: Float[np.ndarray, " c"]
     reached: int
 
     @property
-    def best(self) -> tuple[float, ...]:
+    def best(self) -> Point:
         """The setting where the climb ended."""
         return tuple(self.points[self.reached].tolist())
 
     @property
-    def weights(self) -> np.ndarray:
-        """p(setting | answers) of each, all being as likely beforehand, shape (C,), summing to 1."""
-        return np.exp(self.log_evidence - logsumexp(self.log_evidence))
+    def weights(self) -> Float[np.ndarray, " c"]:
+        """p(setting | answers) of each under a uniform prior; they sum to 1."""
+        weights: Float[np.ndarray, " c"] = np.exp(self.log_evidence - logsumexp(self.log_evidence))
+        return weights
 
 
 def search_hyperparameters(
-    candidate: Callable[[tuple[float, ...]], Candidate],
+    candidate: Callable[[Point], Candidate],
     axes: Sequence[Sequence[float]],
     *,
     start: Sequence[float],
     together: int = 0,
-    rounds: int = 2,
 ) -> HyperparameterSearch:
-    """Climb the evidence over a grid, one axis at a time, instead of weighing the whole grid.
+    """Climb the marginal likelihood over a grid, one axis at a time (coordinate ascent).
 
-    A length scale of its own for each of S dimensions makes a grid of 5^S, of which this examines about 5 + 4S.
+    With five length scales for each of S dimensions the grid has 5^S points, and the climb examines about 5 + 4S.
 
     Args:
       candidate: makes the candidate of a point of the grid; its answers must be the same everywhere.
       axes: the values of each axis, in increasing order.
       start: where to begin; each value must be in its axis.
-      together: so many axes at the front, of equal values, are first moved as one over all their values.
-      rounds: how often each axis is gone through at most.
+      together: number of axes at the front, of equal values, that are first moved as one over all their values.
 
     Returns:
-      the points examined and where it ended: at the start, where the answers speak for nothing else.
+      the points examined, and where the climb ended: at the start, where no neighbour is more likely.
 
     Raises:
       ValueError: a start that is not on the grid; else as `fit_gaussian`.
     """
     if len(start) != len(axes) or any(value not in axis for value, axis in zip(start, axes, strict=True)):
         raise ValueError(f"start: expected a value of each of {len(axes)} axes, got {tuple(start)}")
-    found: dict[tuple[float, ...], float] = {}
+    found: dict[Point, float] = {}
 
-    def weigh(point: tuple[float, ...]) -> float:
+    def weigh(point: Point) -> float:
         if point not in found:
-            found[point] = float(candidate(point).fit().log_evidence)
+            found[point] = candidate(point).fit().log_evidence
         return found[point]
 
-    def better(point: tuple[float, ...], best: tuple[float, ...]) -> bool:
+    def better(point: Point, best: Point) -> bool:
         return weigh(point) > weigh(best) + LEAST_GAIN
 
     best = tuple(float(value) for value in start)
@@ -100,7 +101,17 @@ def search_hyperparameters(
     for value in axes[0] if together else ():
         point = (float(value),) * together + best[together:]
         best = point if better(point, best) else best
-    for _ in range(rounds):
+    best = _climb(best, axes, better)
+    return HyperparameterSearch(
+        points=np.array(list(found)).reshape(len(found), -1),
+        log_evidence=np.array(list(found.values())),
+        reached=list(found).index(best),
+    )
+
+
+def _climb(best: Point, axes: Sequence[Sequence[float]], better: Callable[[Point, Point], bool]) -> Point:
+    """Where single steps along the axes lead, each taken only if it is `better`."""
+    for _ in range(ROUNDS):
         before = best
         for axis, values in enumerate(axes):
             for direction in (-1, 1):
@@ -112,8 +123,4 @@ def search_hyperparameters(
                     best, position = point, position + direction
         if best == before:
             break
-    return HyperparameterSearch(
-        points=np.array(list(found)).reshape(len(found), -1),
-        log_evidence=np.array(list(found.values())),
-        reached=list(found).index(best),
-    )
+    return best

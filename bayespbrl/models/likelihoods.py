@@ -12,22 +12,26 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 LIKELIHOODS = ("mixed", "logistic", "probit")  # names of those that have neither lapses nor ties
+Scalar = float | Float[Array, ""]  # a number, or what JAX makes of it where it traces a function
+Margins = Float[Array, "*b k"] | Float[np.ndarray, "*b k"]
 
 
 class ProbitMixture(NamedTuple):
     """p(t) = constant + Σⱼ weights[j] Φ((t − offsets[j]) / scales[j]); a scale of 0 is a step with ½ at its offset.
 
-    `constant` may be (K,) and `weights` (K, J) where the answers are of different kinds.
+    Answers of different kinds each have a constant and weights.
     """
 
-    constant: float | np.ndarray
-    weights: np.ndarray
-    offsets: np.ndarray
-    scales: np.ndarray
+    constant: float | Float[np.ndarray, " k"]
+    weights: Float[np.ndarray, " j"] | Float[np.ndarray, "k j"]
+    offsets: Float[np.ndarray, " j"]
+    scales: Float[np.ndarray, " j"]
 
-    def of(self, rows: np.ndarray) -> "ProbitMixture":
+    def of(self, rows: Bool[np.ndarray, " k"] | Int[np.ndarray, " n"]) -> "ProbitMixture":
         """That of some of the answers; the same where all are of one kind."""
         if np.ndim(self.weights) == 1:
             return self
@@ -38,7 +42,7 @@ class ProbitMixture(NamedTuple):
 class Likelihood(Protocol):
     """The probability of the answer that was given, as a function of its margin; a JAX pytree."""
 
-    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
         """(e, q) with p(answer | t) = exp(e) q, elementwise, e ≤ 0 and q never much below 1/(2K).
 
         The product of the q over some dozens of answers cannot underflow, so their logarithm is taken once.
@@ -50,26 +54,26 @@ class Likelihood(Protocol):
         ...
 
 
-def log_prob(likelihood: Likelihood, margins: jax.Array) -> jax.Array:
+def log_prob(likelihood: Likelihood, margins: Margins) -> Float[Array, "*b k"]:
     """log p(answer | t), elementwise; JAX-traceable, in the dtype of `margins`."""
     exponent, ratio = likelihood.factor(margins)
     return exponent + jnp.log(ratio)
 
 
-def prob(likelihood: Likelihood, margins: np.ndarray) -> np.ndarray:
+def prob(likelihood: Likelihood, margins: Float[np.ndarray, "*b k"]) -> Float[np.ndarray, "*b k"]:
     """p(answer | t), elementwise, in float64."""
     with jax.enable_x64(True):
-        return np.exp(np.asarray(_log_prob(likelihood, margins)))
+        probabilities: Float[np.ndarray, "*b k"] = np.exp(np.asarray(_log_prob(likelihood, margins)))
+    return probabilities
 
 
 _log_prob = jax.jit(log_prob)
 
 
-def total_log_prob(likelihood: Likelihood, margins: jax.Array, used: jax.Array | None = None) -> jax.Array:
-    """Σ log p over the answers where `used`, all when None; margins of shape (..., K).
-
-    One logarithm for 32 answers: it costs most.
-    """
+def total_log_prob(
+    likelihood: Likelihood, margins: Margins, used: Bool[Array, " k"] | Bool[np.ndarray, " k"] | None = None
+) -> Float[Array, "*b"]:
+    """Σ log p over the answers where `used`, all when None. One logarithm for 32 answers, because it costs most."""
     exponent, ratio = likelihood.factor(margins)
     if used is not None:
         exponent, ratio = jnp.where(used, exponent, 0), jnp.where(used, ratio, 1)
@@ -79,7 +83,7 @@ def total_log_prob(likelihood: Likelihood, margins: jax.Array, used: jax.Array |
 
 
 @lru_cache(maxsize=1)
-def _logistic_mixture() -> tuple[np.ndarray, np.ndarray]:
+def _logistic_mixture() -> tuple[Float[np.ndarray, " j"], Float[np.ndarray, " j"]]:
     """Weights and scales with sigmoid(x) = Σⱼ weights[j] Φ(x / scales[j]), to 1e-15 everywhere.
 
     The trapezoidal rule in log κ over the Kolmogorov density, Σₙ (−1)ⁿ⁺¹ 8 n² κ exp(−2n²κ²), or its theta-function twin
@@ -105,16 +109,17 @@ class Mixed:
       number_of_preferences: K of eq. 8. It stays the full K when the likelihood predicts a held-out answer.
     """
 
-    steepness: float
-    number_of_preferences: float
+    steepness: Scalar
+    number_of_preferences: Scalar
 
-    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
         """exp(min(m t, 0)) times a ratio between 1/(2K) and 1."""
         scaled = self.steepness * margins
         decay = jnp.exp(-jnp.abs(scaled))
         share = 1 / self.number_of_preferences
         above = 1 + decay * (1 - share)
         # at 0 the step is ½; a NaN margin makes `decay` NaN and stays NaN
+        # eq. 8, its step and its sigmoid at once
         return jnp.minimum(scaled, 0), jnp.where(margins > 0, above, jnp.where(margins < 0, share, 1.0)) / (1 + decay)
 
     def probit_mixture(self) -> ProbitMixture:
@@ -129,9 +134,9 @@ class Mixed:
 class Logistic:
     """Bradley–Terry: sigmoid(m t)."""
 
-    steepness: float
+    steepness: Scalar
 
-    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
         """exp(min(m t, 0)) / (1 + exp(−|m t|))."""
         scaled = self.steepness * margins
         return jnp.minimum(scaled, 0), 1 / (1 + jnp.exp(-jnp.abs(scaled)))
@@ -147,9 +152,9 @@ class Logistic:
 class Probit:
     """Thurstone: Φ(m t)."""
 
-    steepness: float
+    steepness: Scalar
 
-    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
         """Φ(m t) itself is the exponential of its logarithm."""
         exponent = jax.scipy.special.log_ndtr(self.steepness * margins)
         return exponent, jnp.ones_like(exponent)
@@ -170,9 +175,9 @@ class WithLapses:
     """
 
     attentive: Mixed | Logistic | Probit
-    lapse_rate: float
+    lapse_rate: Scalar
 
-    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
         """The larger of both terms' exponents is taken out."""
         exponent, ratio = self.attentive.factor(margins)
         floor = jnp.log(self.lapse_rate / 2)
@@ -182,8 +187,8 @@ class WithLapses:
     def probit_mixture(self) -> ProbitMixture:
         """The mixture shrunk, and a constant."""
         constant, weights, offsets, scales = self.attentive.probit_mixture()
-        keep = 1 - self.lapse_rate
-        return ProbitMixture(self.lapse_rate / 2 + keep * constant, keep * weights, offsets, scales)
+        lapses, keep = float(self.lapse_rate), 1 - float(self.lapse_rate)
+        return ProbitMixture(lapses / 2 + keep * constant, keep * weights, offsets, scales)
 
 
 @jax.tree_util.register_dataclass
@@ -196,14 +201,14 @@ class WithTies:
     Attributes:
       ordered: the likelihood p of an answer without a threshold.
       threshold: δ > 0, in units of the margin.
-      indifferent: which answers were "no difference", shape (K,) bool, in the order of the margins' last axis.
+      indifferent: which answers were "no difference", in the order of the margins' last axis.
     """
 
     ordered: Mixed | Logistic | Probit | WithLapses
-    threshold: float
-    indifferent: jax.Array | np.ndarray
+    threshold: Scalar
+    indifferent: Bool[Array, " k"] | Bool[np.ndarray, " k"]
 
-    def factor(self, margins: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
         """The last axis of `margins` is K."""
         preferred = log_prob(self.ordered, margins - self.threshold)
         # p(tie) is symmetric: at −|t| both terms are small and their difference keeps its relative precision
@@ -224,30 +229,5 @@ class WithTies:
         )
 
 
-def _mixture(weights: np.ndarray, scales: np.ndarray) -> ProbitMixture:
+def _mixture(weights: Float[np.ndarray, " j"], scales: Float[np.ndarray, " j"]) -> ProbitMixture:
     return ProbitMixture(0.0, weights, np.zeros_like(scales), scales)
-
-
-def preference_likelihood(
-    name: str, *, steepness: float, number_of_preferences: int, lapse_rate: float = 0.0
-) -> Mixed | Logistic | Probit | WithLapses:
-    """The likelihood called `name`: "mixed" (eq. 8), "logistic" or "probit", with lapses where λ > 0.
-
-    Raises:
-      ValueError: an unknown name, steepness m ≤ 0, or a lapse rate outside [0, 1).
-    """
-    if not (np.isfinite(steepness) and steepness > 0):
-        raise ValueError(f"steepness: expected a finite number > 0, got {steepness}")
-    if not 0 <= lapse_rate < 1:
-        raise ValueError(f"lapse_rate: expected a number in [0, 1), got {lapse_rate}")
-    likelihood: Mixed | Logistic | Probit
-    match name:
-        case "mixed":
-            likelihood = Mixed(float(steepness), float(max(number_of_preferences, 1)))
-        case "logistic":
-            likelihood = Logistic(float(steepness))
-        case "probit":
-            likelihood = Probit(float(steepness))
-        case _:
-            raise ValueError(f'likelihood: expected "mixed", "logistic" or "probit", got {name!r}')
-    return WithLapses(likelihood, float(lapse_rate)) if lapse_rate > 0 else likelihood

@@ -4,6 +4,10 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from bayespbrl import checks
 
 
 @dataclass(frozen=True)
@@ -11,19 +15,19 @@ class LinearProgramResult:
     """Solution of eq. 10.
 
     Attributes:
-      weights: w, |w_j| ≤ 1, shape (D,).
+      weights: w, |w_j| ≤ 1.
       objective: Σ_k c(d_k), c(x) = x for x > 0 and 2x otherwise.
       status: the solver's own words.
       converged: whether the solver reports an optimum.
     """
 
-    weights: np.ndarray
+    weights: Float[np.ndarray, " d"]
     objective: float
     status: str
     converged: bool
 
 
-def linear_program(differences: np.ndarray) -> LinearProgramResult:
+def linear_program(differences: ArrayLike) -> LinearProgramResult:
     """Maximise Σ_k c(d_k) over |w_j| ≤ 1 with d = differences @ w (eq. 10), by HiGHS through CasADi.
 
     c is concave, c(x) = min(x, 2x), so the maximum is a linear program: max Σ t_k, t_k ≤ d_k, t_k ≤ 2 d_k. With
@@ -35,12 +39,11 @@ def linear_program(differences: np.ndarray) -> LinearProgramResult:
     Raises:
       ValueError: `differences` is not a finite matrix.
     """
-    differences = np.asarray(differences, dtype=float)
-    if differences.ndim != 2 or not np.all(np.isfinite(differences)):
-        raise ValueError(f"differences: expected a finite matrix (K, D), got shape {differences.shape} or NaN/infinity")
+    differences = checks.matrix("differences", differences)
     number, dimension = differences.shape
     if number == 0 or dimension == 0:
         return LinearProgramResult(np.zeros(dimension), 0.0, "nothing to solve", True)
+    # variables (w, p, n): Ψw − p + n = 0, cost −Σ p_k + 2 Σ n_k
     constraints = ca.DM(np.hstack([differences, -np.eye(number), np.eye(number)]))
     cost = np.concatenate([np.zeros(dimension), -np.ones(number), 2 * np.ones(number)])
     solver = ca.conic(
@@ -58,7 +61,7 @@ def linear_program(differences: np.ndarray) -> LinearProgramResult:
     margins = differences @ weights
     return LinearProgramResult(
         weights,
-        float(np.sum(np.minimum(margins, 2 * margins))),
+        float(np.sum(np.minimum(margins, 2 * margins))),  # eq. 10
         str(statistics["return_status"]),
         bool(statistics["success"]),
     )

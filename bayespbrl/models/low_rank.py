@@ -5,8 +5,10 @@ orthogonal to Q keeps its prior: its draws are exact prior noise and its posteri
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -16,16 +18,16 @@ class LowRank:
     """Ψ = L Qᵀ.
 
     Attributes:
-      loadings: L, shape (K, r). Rows of zero differences are exactly zero.
-      basis: Q with orthonormal columns, shape (D, r).
+      loadings: L. Rows of zero differences are exactly zero.
+      basis: Q with orthonormal columns.
     """
 
-    loadings: np.ndarray
-    basis: np.ndarray
+    loadings: Float[np.ndarray, "k r"]
+    basis: Float[np.ndarray, "d r"]
 
 
-def low_rank(differences: np.ndarray) -> LowRank:
-    """Factorise `differences` (K, D), independently of the scale of each row.
+def low_rank(differences: Float[np.ndarray, "k d"]) -> LowRank:
+    """Factorise Ψ independently of the scale of each row.
 
     Rows are scaled to unit length before the factorisation, so that a small row keeps its sign, and exactly zero rows
     are set aside: rounding would otherwise turn them into hard constraints. The rank counts the singular values above
@@ -45,28 +47,39 @@ def low_rank(differences: np.ndarray) -> LowRank:
     return LowRank(loadings, directions @ right[:rank].T)
 
 
-def used_rows(loadings: np.ndarray) -> np.ndarray:
-    """Which answers tell anything: the rows of L, (K, r), that are not exactly zero; shape (K,) bool."""
-    return np.any(loadings != 0, axis=1)
+def used_rows(loadings: Float[np.ndarray, "k r"]) -> Bool[np.ndarray, " k"]:
+    """Which answers carry information: the rows of L that are not exactly zero."""
+    used: Bool[np.ndarray, " k"] = np.any(loadings != 0, axis=1)
+    return used
 
 
 class UtilityWeights(BackendArray):
-    """Draws of w = Q z + σ (I − QQᵀ) ε, shape (C, draws, D), computed where they are indexed.
+    """Draws of w = Q z + σ (I − QQᵀ) ε, of shape (chain, draw, feature), computed where they are indexed.
 
     ε comes from a counter-based generator keyed by the seed, the chain and the draw: the same draw is the same array
     however it is reached.
     """
 
-    def __init__(self, coordinates: np.ndarray, basis: np.ndarray, *, prior_scale: float, seed: int) -> None:
+    def __init__(
+        self,
+        coordinates: Float[np.ndarray, "chain draw r"],
+        basis: Float[np.ndarray, "d r"],
+        *,
+        prior_scale: float,
+        seed: int,
+    ) -> None:
         self.coordinates, self.basis = coordinates, basis
         self.prior_scale, self.seed = prior_scale, seed
         self.shape = (*coordinates.shape[:2], len(basis))
         self.dtype = np.dtype(np.float64)
 
-    def __getitem__(self, key: indexing.ExplicitIndexer) -> np.ndarray:
-        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._outer)
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Float[np.ndarray, "..."] | np.float64:
+        draws: np.ndarray | np.float64 = indexing.explicit_indexing_adapter(
+            key, self.shape, indexing.IndexingSupport.OUTER, self._outer
+        )
+        return draws
 
-    def _outer(self, key: tuple) -> np.ndarray:
+    def _outer(self, key: tuple[Any, ...]) -> Float[np.ndarray, "..."] | np.float64:
         chains, draws = (np.atleast_1d(np.arange(n)[k]) for n, k in zip(self.shape[:2], key[:2], strict=True))
         weights = np.empty((len(chains), len(draws), self.shape[2]))
         for i, chain in enumerate(chains):
@@ -75,11 +88,12 @@ class UtilityWeights(BackendArray):
         keep = tuple(0 if np.ndim(k) == 0 and not isinstance(k, slice) else slice(None) for k in key[:2])
         return weights[(*keep, key[2])]
 
-    def draw(self, chain: int, draw: int) -> np.ndarray:
-        """One draw of w, shape (D,)."""
+    def draw(self, chain: int, draw: int) -> Float[np.ndarray, " d"]:
+        """One draw of w."""
         generator = np.random.Generator(np.random.Philox(key=self.seed, counter=[0, 0, chain, draw]))
         noise = self.prior_scale * generator.standard_normal(self.shape[2])
         # twice: one projection leaves a rounding error of the size of the margins' smallest directions
         for _ in range(2):
             noise -= self.basis @ (self.basis.T @ noise)
-        return self.basis @ self.coordinates[chain, draw] + noise
+        weights: Float[np.ndarray, " d"] = self.basis @ self.coordinates[chain, draw] + noise
+        return weights

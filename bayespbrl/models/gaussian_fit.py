@@ -1,0 +1,92 @@
+"""A posterior's thin factorisation and Gaussian approximation: where sampling begins, and the marginal likelihood."""
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from threadpoolctl import ThreadpoolController
+
+from bayespbrl import checks
+from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
+from bayespbrl.models.likelihoods import Likelihood, prob
+from bayespbrl.models.low_rank import LowRank, low_rank, used_rows
+from bayespbrl.models.preference_model import PreferenceModel
+
+
+@dataclass(frozen=True)
+class GaussianFit:
+    """A posterior's thin factorisation and its Gaussian approximation.
+
+    Attributes:
+      factors: Ψ = L Qᵀ.
+      likelihood: p.
+      prior_scale: σ.
+      approximation: expectation propagation's, of z.
+      log_evidence: expectation propagation's log marginal likelihood of all answers, rows of zeros included, nats.
+    """
+
+    factors: LowRank
+    likelihood: Likelihood
+    prior_scale: float
+    approximation: GaussianApproximation
+    log_evidence: float
+
+
+def fit_gaussian(
+    differences: ArrayLike,
+    model: PreferenceModel,
+    *,
+    indifferent: ArrayLike | None = None,
+    number_of_preferences: int | None = None,
+) -> GaussianFit:
+    """Factorise the differences (K, D) and fit a Gaussian by expectation propagation.
+
+    Args:
+      differences, indifferent, number_of_preferences: as of `sample_posterior`.
+      model: prior and likelihood.
+    """
+    differences = checked_differences(differences)
+    number = len(differences)
+    tied = np.zeros(number, dtype=bool) if indifferent is None else np.asarray(indifferent)
+    if tied.shape != (number,) or tied.dtype != bool:
+        raise ValueError(f"indifferent: expected bool of shape ({number},), got {tied.dtype} of shape {tied.shape}")
+    likelihood = model.answer_likelihood(number if number_of_preferences is None else number_of_preferences, tied)
+    with one_blas_thread():
+        return _fit_gaussian(differences, model.prior_scale, likelihood)
+
+
+def _fit_gaussian(differences: Float[np.ndarray, "k d"], prior_scale: float, likelihood: Likelihood) -> GaussianFit:
+    factors = low_rank(differences)
+    used = used_rows(factors.loadings)
+    mixture = likelihood.probit_mixture().of(used)
+    approximation = expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale)
+    log_evidence = approximation.log_evidence
+    if not np.all(used):  # rows of zeros have a factor of their own; else nothing is compiled for a new K
+        log_evidence += float(np.sum(np.log(prob(likelihood, np.zeros(len(used)))[~used])))
+    return GaussianFit(factors, likelihood, prior_scale, approximation, log_evidence)
+
+
+def checked_differences(differences: ArrayLike) -> Float[np.ndarray, "k d"]:
+    """As float64; `ValueError` unless they are a finite matrix (K, D), D >= 1."""
+    differences = checks.matrix("differences", differences)
+    if differences.shape[1] == 0:
+        raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
+    return differences
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def one_blas_thread() -> AbstractContextManager[object]:
+    """A context in which BLAS uses one thread.
+
+    NumPy and SciPy bring a BLAS each, whose idle threads spin. From K = 80 on the Gaussian fit would take ten times as
+    long.
+    """
+    context: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
+    return context

@@ -1,0 +1,89 @@
+"""A posterior as a DataTree in ArviZ's schema, to keep in memory and on disk."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from xarray.core import indexing
+
+from bayespbrl.models.chains import Chains
+from bayespbrl.models.convergence import Convergence
+from bayespbrl.models.gaussian_fit import GaussianFit
+from bayespbrl.models.likelihoods import WithTies
+from bayespbrl.models.low_rank import UtilityWeights, low_rank
+
+
+def posterior_tree(
+    differences: Float[np.ndarray, "k d"],
+    fit: GaussianFit,
+    chains: Chains,
+    length: int,
+    report: Convergence,
+    settings: Mapping[str, float | str],
+) -> xr.DataTree:
+    """The first `length` draws of the chains, with the groups that `sample_posterior` describes.
+
+    Args:
+      differences, fit: as the chains began.
+      report: of the margins' draws.
+      settings: model, seed and number of preferences, which become attributes.
+    """
+    sample, answer = ("chain", "draw"), ("chain", "draw", "preference")
+    z, answers, stuck, candidates = (
+        chains.collected(name, length) for name in ("coordinates", "answers", "stuck", "candidates")
+    )
+    lp = np.sum(answers, axis=2)
+    labels = {"chain": np.arange(z.shape[0]), "draw": np.arange(length)}
+    likelihood, basis = fit.likelihood, fit.factors.basis
+    tied = np.asarray(likelihood.indifferent) if isinstance(likelihood, WithTies) else np.zeros(len(differences), bool)
+    most_likely = z[np.unravel_index(np.argmax(lp), lp.shape)]
+    points = {"mean": basis @ z.mean(axis=(0, 1)), "most_likely": basis @ most_likely}
+    attributes = {
+        "log_evidence": fit.log_evidence,
+        "log_evidence_converged": int(fit.approximation.converged),
+        "rhat_max": report.rhat_max,
+        "effective_sample_size_min": min(report.effective_sample_size_min, float(lp.size)),
+        "converged": int(report.converged()),
+        "stuck": int(np.sum(stuck)),
+        **settings,
+    }
+    draws = {"margins": (answer, z @ fit.factors.loadings.T), "coordinates": ((*sample, "coordinate"), z)}
+    statistics = {"lp": (sample, lp), "candidates": (sample, candidates), "stuck": (sample, stuck)}
+    root = xr.Dataset({f"utility_weights_{name}": ("feature", w) for name, w in points.items()}, attrs=attributes)
+    return xr.DataTree.from_dict(
+        {
+            "/": root,
+            "/posterior": _with_weights(xr.Dataset(draws, labels), basis, attributes),
+            "/sample_stats": xr.Dataset(statistics, labels),
+            "/log_likelihood": xr.Dataset({"answers": (answer, answers)}, labels),
+            "/observed_data": xr.Dataset({"answers": ("preference", (~tied).astype(np.int8))}),
+            "/constant_data": xr.Dataset({"differences": (("preference", "feature"), differences)}),
+        }
+    )
+
+
+def _with_weights(posterior: xr.Dataset, basis: Float[np.ndarray, "d r"], settings: Mapping[Any, Any]) -> xr.Dataset:
+    z = posterior["coordinates"].values
+    lazy = UtilityWeights(z, basis, prior_scale=float(settings["prior_scale"]), seed=int(settings["seed"]))
+    weights = xr.Variable(("chain", "draw", "feature"), indexing.LazilyIndexedArray(lazy))
+    return posterior.assign(utility_weights=weights)
+
+
+def stored(tree: xr.DataTree) -> xr.DataTree:
+    """The tree without the computed `posterior["utility_weights"]`, to write to disk; `restored` brings it back."""
+    posterior = tree.children["posterior"].to_dataset(inherit=False).drop_vars("utility_weights", errors="ignore")
+    return _replaced(tree, posterior)
+
+
+def restored(tree: xr.DataTree) -> xr.DataTree:
+    """A tree read back from disk, with `posterior["utility_weights"]` computed where it is indexed, as before."""
+    basis = low_rank(tree.children["constant_data"].to_dataset()["differences"].values).basis
+    posterior = tree.children["posterior"].to_dataset(inherit=False)
+    return _replaced(tree, _with_weights(posterior, basis, tree.attrs))
+
+
+def _replaced(tree: xr.DataTree, posterior: xr.Dataset) -> xr.DataTree:
+    groups = {path: node.to_dataset(inherit=False) for path, node in tree.subtree_with_keys}
+    return xr.DataTree.from_dict({**groups, "posterior": posterior})
