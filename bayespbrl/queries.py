@@ -90,73 +90,58 @@ class QuerySituation:
 QueryRule = Callable[[QuerySituation], Sequence[int]]
 
 
-@dataclass(frozen=True)
-class HighestUtility:
+def highest_utility(situation: QuerySituation) -> list[int]:
     """The trajectory of highest expected utility wᵀψ(τ) first, equal ones in their order: the paper's rule."""
-
-    def __call__(self, situation: QuerySituation) -> list[int]:
-        new = [situation.trajectories[number] for number in situation.new]
-        order = np.argsort(-situation.estimate.trajectory_utilities(new), kind="stable")
-        return [situation.new[index] for index in order]
+    new = [situation.trajectories[number] for number in situation.new]
+    order = np.argsort(-situation.estimate.trajectory_utilities(new), kind="stable")
+    return [situation.new[index] for index in order]
 
 
-@dataclass(frozen=True)
-class ProbablyBetter:
+def probably_better(situation: QuerySituation) -> list[int]:
     """The trajectory that is most probably better than the incumbent first."""
-
-    def __call__(self, situation: QuerySituation) -> list[int]:
-        utilities, incumbent = situation.draws()
-        return _ordered(situation, utilities, probability_better(utilities, incumbent))
+    utilities, incumbent = situation.draws()
+    return _ordered(situation, utilities, probability_better(utilities, incumbent))
 
 
-@dataclass(frozen=True)
-class Thompson:
+def thompson(situation: QuerySituation) -> list[int]:
     """The trajectory of highest utility in one posterior draw first (Thompson 1933)."""
-
-    def __call__(self, situation: QuerySituation) -> list[int]:
-        utilities, _ = situation.draws()
-        return _ordered(situation, utilities, utilities[situation.rng.integers(len(utilities))])
+    utilities, _ = situation.draws()
+    return _ordered(situation, utilities, utilities[situation.rng.integers(len(utilities))])
 
 
-@dataclass(frozen=True)
-class Information:
+def information(situation: QuerySituation) -> list[int]:
     """The comparison with the incumbent whose answer has the highest `expected_information` first."""
-
-    def __call__(self, situation: QuerySituation) -> list[int]:
-        utilities, incumbent = situation.draws()
-        scores = expected_information(utilities, incumbent, likelihood=situation.estimate.likelihood)
-        return _ordered(situation, utilities, scores)
+    utilities, incumbent = situation.draws()
+    scores = expected_information(utilities, incumbent, likelihood=situation.estimate.likelihood)
+    return _ordered(situation, utilities, scores)
 
 
-@dataclass(frozen=True)
-class Disagreement:
+def disagreement(situation: QuerySituation) -> list[int]:
     """The comparison with the incumbent that the draws disagree on most first: the variance of which is better."""
-
-    def __call__(self, situation: QuerySituation) -> list[int]:
-        utilities, incumbent = situation.draws()
-        better = probability_better(utilities, incumbent)
-        return _ordered(situation, utilities, better * (1 - better))
+    utilities, incumbent = situation.draws()
+    better = probability_better(utilities, incumbent)
+    return _ordered(situation, utilities, better * (1 - better))
 
 
 @dataclass(frozen=True)
 class InformationWhenUnsure:
-    """`HighestUtility` while the signal is at least `sure`; else `Information` about any trajectory never shown."""
+    """`highest_utility` while the signal is at least `sure`; else `information` about any trajectory never shown."""
 
     sure: float = 0.75
 
     def __call__(self, situation: QuerySituation) -> list[int]:
         if (situation.signal or 0.0) >= self.sure:
-            return HighestUtility()(situation)
+            return highest_utility(situation)
         never = [number for number in range(len(situation.trajectories)) if number not in situation.shown]
-        return Information()(replace(situation, new=never))
+        return information(replace(situation, new=never))
 
 
 QUERY_RULES: dict[str, QueryRule] = {
-    "highest-utility": HighestUtility(),
-    "probably-better": ProbablyBetter(),
-    "thompson": Thompson(),
-    "information": Information(),
-    "disagreement": Disagreement(),
+    "highest-utility": highest_utility,
+    "probably-better": probably_better,
+    "thompson": thompson,
+    "information": information,
+    "disagreement": disagreement,
     "information-when-unsure": InformationWhenUnsure(),
 }
 

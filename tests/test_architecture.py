@@ -159,3 +159,35 @@ def test_the_rule_refuses_what_it_should():
     assert not permitted("models.posterior", "utility.estimate")
     assert permitted("learner", "utility.averaging")
     assert {"policies", "improvement.q_function", "improvement.reps"} <= ours("improvement.update")
+
+
+MOST_LINES, MOST_BODY, MOST_PARAMETERS, MOST_ROOMS = 350, 45, 7, 14
+# Where a user's keyword options are the convenience.
+MANY_PARAMETERS = {"infer_utility", "sample_posterior"}
+
+
+def functions():
+    for module in MODULES:
+        for node in ast.walk(tree_of(module)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                yield module, node
+
+
+def test_the_rooms_are_small():
+    assert {m: n for m, p in MODULES.items() if (n := len(p.read_text().splitlines())) > MOST_LINES} == {}
+    assert len(list(ROOT.glob("*.py"))) <= MOST_ROOMS
+
+
+def test_functions_are_short_and_take_few_parameters():
+    long, wide = [], []
+    for module, node in functions():
+        documented = ast.get_docstring(node) is not None and len(node.body) > 1
+        body = node.end_lineno - node.body[documented].lineno + 1
+        if body > MOST_BODY:
+            long.append(f"{module}.{node.name}: {body} lines")
+        arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        number = len(arguments) - bool(arguments and arguments[0].arg in ("self", "cls"))
+        door = node.name in MANY_PARAMETERS or floor_of(module) == "command line"
+        if number > MOST_PARAMETERS and not node.name.startswith("_") and not door:
+            wide.append(f"{module}.{node.name}: {number} parameters")
+    assert (long, wide) == ([], [])

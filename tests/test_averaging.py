@@ -79,7 +79,9 @@ def test_mean_and_spread_are_those_of_the_mixture_by_importance_sampling():
     of_each = np.array([part.sum() for part in np.split(p, 9)]).reshape(3, 3).sum(axis=1)
     np.testing.assert_allclose(estimate.probabilities, of_each, atol=0.03)
     assert of_each.max() > 2 * of_each.min()  # the answers speak for some more than for others
-    draws = np.concatenate([averaged(LINE, trajectories, pairs, seed=s).state_draws(STATES) for s in range(10)])
+    draws = np.concatenate(
+        [averaged(LINE, trajectories, pairs, seed=s).utilities_and_draws(STATES)[1] for s in range(10)]
+    )
     assert draws.shape == (2000, 7)
     np.testing.assert_allclose(draws.mean(axis=0), mean, atol=4 * spread.max() / np.sqrt(2000) + 0.03 * spread.max())
     np.testing.assert_allclose(draws.std(axis=0), spread, rtol=0.1)
@@ -95,11 +97,11 @@ def test_a_trajectory_is_worth_the_sum_of_its_states_in_the_mean_and_in_every_dr
     )
     for number in (None, 50, 1):
         drawn = estimate.trajectory_draws(trajectories, number=number)
-        of_states = estimate.state_draws(states, number=number)
+        of_states = estimate.utilities_and_draws(states, number=number)[1]
         np.testing.assert_allclose(drawn, of_states.reshape(len(drawn), 4, 6).sum(axis=2), atol=1e-10)
     assert len(drawn) == 1
     with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
-        estimate.state_draws(states, number=0)
+        estimate.utilities_and_draws(states, number=0)[1]
 
 
 def test_mean_and_draws_in_one_pass_are_those_of_two():
@@ -109,14 +111,15 @@ def test_mean_and_draws_in_one_pass_are_those_of_two():
     for estimate in (averaged(LINE, trajectories, PAIRS), one):
         mean, draws = estimate.utilities_and_draws(STATES, number=20)
         np.testing.assert_allclose(mean, estimate.utilities(STATES), rtol=1e-12)
-        np.testing.assert_allclose(draws, estimate.state_draws(STATES, number=20), rtol=1e-12)
+        every = estimate.utilities_and_draws(STATES)[1]
+        np.testing.assert_allclose(draws, every[:: len(every) // 20], rtol=1e-12)
         assert draws.shape == (20, len(STATES))
 
 
 def test_each_draw_is_of_its_own_component():
     estimate = averaged(LINE, walks(), PAIRS)
     assert len(set(estimate.components)) == len(BANDWIDTH_MULTIPLES)  # three answers leave all open
-    drawn = estimate.state_draws(STATES)
+    drawn = estimate.utilities_and_draws(STATES)[1]
     for draw in (0, 77, 199):
         features = LINE.rescaled(estimate.multiples[estimate.components[draw]])
         np.testing.assert_allclose(drawn[draw], features(STATES) @ estimate.weight_draws[draw], atol=1e-12)
@@ -148,7 +151,9 @@ def test_a_run_keeps_the_average(tmp_path):
     states = learner.trajectories[0].states
     assert len(estimate.multiples) > 1
     np.testing.assert_array_equal(estimate.utilities(states), learner.estimate.utilities(states))
-    np.testing.assert_array_equal(estimate.state_draws(states), learner.estimate.state_draws(states))
+    np.testing.assert_array_equal(
+        estimate.utilities_and_draws(states)[1], learner.estimate.utilities_and_draws(states)[1]
+    )
     report = learner_report(tmp_path / "run")
     assert f"an average over {len(estimate.multiples)} choices of length scales" in report
 

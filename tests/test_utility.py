@@ -192,7 +192,6 @@ def test_without_a_posterior_there_are_no_draws_and_no_likelihood():
     for name, arguments in {
         "trajectory_draws": ([one],),
         "margin_draws": (one, other),
-        "state_draws": (np.arange(3),),
         "utilities_and_draws": (np.arange(3),),
     }.items():
         with pytest.raises(ValueError, match=f"{name}: expected an estimate with a posterior, got Linear"):

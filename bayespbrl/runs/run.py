@@ -15,7 +15,7 @@ from bayespbrl.improvement.schedules import ConstantBound
 from bayespbrl.learner import Learner
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
-from bayespbrl.queries import HighestUtility
+from bayespbrl.queries import highest_utility
 from bayespbrl.runs.directory import RunDirectory, fresh_directory
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
@@ -92,7 +92,7 @@ def load(
     if log.settings.update.schedule == "other" and schedule is None:
         schedule = ConstantBound()
     if log.settings.questions.query == "other" and query is None:
-        query = HighestUtility()
+        query = highest_utility
     return Run(log.path, _restored(log, env, features, policy, schedule, query))
 
 

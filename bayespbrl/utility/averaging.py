@@ -16,8 +16,8 @@ from scipy.special import softmax
 
 from bayespbrl.features import StateFeatures
 from bayespbrl.models import PreferenceModel
-from bayespbrl.models.likelihoods import Likelihood
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian
+from bayespbrl.models.likelihoods import Likelihood
 from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
 from bayespbrl.utility.comparisons import Comparisons, number_of_bandwidths, rescaled
 from bayespbrl.utility.hyperparameters import STEEPNESS_MULTIPLES
@@ -79,10 +79,6 @@ class AveragedUtility:
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
         """Expected utility of n states and draws of it, in one pass over the components."""
         return self._mixed(_of_states(states), self._spaced(number))
-
-    def state_draws(self, states: np.ndarray, *, number: int | None = None) -> Float[np.ndarray, "s n"]:
-        """Draws of the utility of n states."""
-        return self._mixed(_of_states(states), self._spaced(number))[1]
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
         """Expected utility of each trajectory."""

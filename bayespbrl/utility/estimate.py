@@ -16,7 +16,7 @@ class UtilityEstimate(Protocol):
     """An estimate of the expert's utility: a point, or a posterior with draws.
 
     `sampled` says which. Where it is None the methods that need a posterior (`likelihood`, `trajectory_draws`,
-    `margin_draws`, `state_draws`, `utilities_and_draws`) raise a ValueError.
+    `margin_draws`, `utilities_and_draws`) raise a ValueError.
     """
 
     @property
@@ -42,10 +42,6 @@ class UtilityEstimate(Protocol):
         self, states: np.ndarray, *, number: int | None = None
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
         """Expected utility of n states and S posterior draws of it, at most `number`, in one pass over the features."""
-        ...
-
-    def state_draws(self, states: np.ndarray, *, number: int | None = None) -> Float[np.ndarray, "s n"]:
-        """S posterior draws of the utility of n states."""
         ...
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
@@ -76,10 +72,6 @@ class WithoutDraws:
     def utilities_and_draws(self, states: np.ndarray, *, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """None: a ValueError."""
         raise self._no_posterior("utilities_and_draws")
-
-    def state_draws(self, states: np.ndarray, *, number: int | None = None) -> np.ndarray:
-        """None: a ValueError."""
-        raise self._no_posterior("state_draws")
 
     def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
         """None: a ValueError."""

@@ -60,13 +60,9 @@ class PosteriorUtility:
     def utilities_and_draws(
         self, states: np.ndarray, *, number: int | None = None
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
-        """`utilities` and `state_draws` of n states, from one evaluation of the features."""
+        """`utilities` of n states and draws of them, all chains in one, from one evaluation of the features."""
         features = self.features(states)
         return linear(features, self.weights), self.draws(features, number=number).reshape(-1, len(states))
-
-    def state_draws(self, states: np.ndarray, *, number: int | None = None) -> Float[np.ndarray, "s n"]:
-        """Posterior draws of wᵀφ(s) of n states, all chains in one."""
-        return self.draws(self.features(states), number=number).reshape(-1, len(states))
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
         """wᵀψ(τ) of each trajectory."""
