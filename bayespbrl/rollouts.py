@@ -2,7 +2,7 @@
 
 An environment with pure functions (`env.unwrapped.dynamics`) and a policy that is a JAX pytree run as one compiled
 `lax.scan` over all episodes at once. Anything else is stepped through the ordinary gymnasium interface: as a vector
-environment if it was opened by its id (the environment's own one where it offers one), else episode by episode.
+environment if it was opened by its id (its own one where it has one), else episode by episode.
 
 Continuous actions are clipped to the action space, and the clipped action is the one stored.
 """
@@ -19,17 +19,23 @@ import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from jax import Array
+from jaxtyping import Bool, Float, Int, Key, Shaped
 
+from bayespbrl.checks import whole
 from bayespbrl.envs import functional
-from bayespbrl.envs.opening import environment_attribute, environment_name, open_environment
+from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, environment_name, open_environment
 from bayespbrl.envs.stepping import episodes_by_interface
+from bayespbrl.policies.policy import AnyArray, Sampler
 from bayespbrl.trajectories import Trajectory
 
 _PHASE = 2**31 - 1  # no step of an episode has this number
-# Level 1 of the compiler's optimisations compiles in three quarters of the time, and what it makes runs as fast.
-_COMPILER = {"xla_backend_optimization_level": 1}
+_COMPILER = {"xla_backend_optimization_level": 1}  # compiles faster, and what it makes runs as fast
 
-__all__ = ["Returns", "compilations", "open_environment", "returns", "rollout", "step_limit"]
+# An episode as it runs: the state of the dynamics, which may be any pytree, the observation, and whether it goes on.
+Running = tuple[Any, Shaped[Array, "..."], Bool[Array, ""]]
+
+__all__ = ["Returns", "open_environment", "returns", "rollout", "step_limit"]
 
 
 @dataclass(frozen=True)
@@ -37,37 +43,42 @@ class Returns:
     """Evaluation of a policy, one entry an episode.
 
     Attributes:
-      total: undiscounted sum of the environment's reward, shape (episodes,).
-      steps: length of the episode, shape (episodes,) int64.
-      terminated: whether it ended in a terminal state (not at the time limit), shape (episodes,) bool.
+      total: undiscounted sum of the environment's reward.
+      steps: length of the episode.
+      terminated: whether it ended in a terminal state (not at the time limit).
     """
 
-    total: np.ndarray
-    steps: np.ndarray
-    terminated: np.ndarray
+    total: Float[np.ndarray, " n"]
+    steps: Int[np.ndarray, " n"]
+    terminated: Bool[np.ndarray, " n"]
 
 
 def rollout(
-    environment: Any, policy: Any, *, key: jax.Array, episodes: int, max_steps: int | None = None, hold: int = 1
+    environment: AnyEnvironment,
+    policy: Sampler,
+    *,
+    key: Key[Array, ""],
+    episodes: int,
+    max_steps: int | None = None,
+    hold: int = 1,
 ) -> tuple[Trajectory, ...]:
     """Trajectories of `episodes` episodes under `policy.sample`.
 
     Args:
       environment: anything `open_environment` takes.
-      policy: has `sample(key, observation) -> action`, JAX-traceable if the policy is a pytree of arrays.
+      policy: its `sample` is JAX-traceable if the policy is a pytree of arrays.
       key: JAX random key; it decides everything, resets included.
       episodes: number of episodes, ≥ 1.
       max_steps: time limit; by default the environment's own.
-      hold: steps for which the policy's random key stays the same, ≥ 1. Each action still follows the policy's law at
-        its state; its chance is that of its neighbours in time, and reaches further than chances that average out.
+      hold: steps for which the policy's random key stays the same, ≥ 1. Each action still follows the policy at its
+        state. Noise that neighbouring steps share leads further away than noise that averages out.
 
     Raises:
       ValueError: bad arguments; no time limit known; an environment that raises or returns NaN, named with the step.
     """
     env = open_environment(environment)
     steps = _checked(env, policy, key, episodes, max_steps)
-    if isinstance(hold, bool) or not isinstance(hold, int | np.integer) or hold < 1:
-        raise ValueError(f"hold: expected an integer ≥ 1, got {hold!r}")
+    whole("hold", hold)
     dynamics = _pure_dynamics(env, policy)
     if dynamics is None:
         return tuple(_by_interface(env, policy, key, episodes, steps, max_steps is not None, hold))
@@ -82,7 +93,14 @@ def rollout(
     )
 
 
-def returns(environment: Any, policy: Any, *, key: jax.Array, episodes: int, max_steps: int | None = None) -> Returns:
+def returns(
+    environment: AnyEnvironment,
+    policy: Sampler,
+    *,
+    key: Key[Array, ""],
+    episodes: int,
+    max_steps: int | None = None,
+) -> Returns:
     """Undiscounted returns of the same episodes as `rollout` with the same arguments, without keeping them.
 
     Raises:
@@ -105,13 +123,11 @@ def returns(environment: Any, policy: Any, *, key: jax.Array, episodes: int, max
     return Returns(total, steps, terminated)
 
 
-def step_limit(environment: Any, max_steps: int | None = None) -> int:
+def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int:
     """The time limit that holds: `max_steps`, else the `TimeLimit` wrapper's, else the spec's, else the dynamics'."""
     env = open_environment(environment)
     if max_steps is not None:
-        if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
-            raise ValueError(f"max_steps: expected an integer ≥ 1, got {max_steps!r}")
-        return int(max_steps)
+        return whole("max_steps", max_steps)
     limits: list[Any] = [layer._max_episode_steps for layer in _layers(env) if isinstance(layer, TimeLimit)]
     limits.append(env.spec.max_episode_steps if env.spec is not None else None)
     limits.append(environment_attribute(env, "max_episode_steps"))
@@ -121,19 +137,12 @@ def step_limit(environment: Any, max_steps: int | None = None) -> int:
     raise ValueError(f"environment {environment_name(env)} states no time limit: expected max_steps, got None")
 
 
-def compilations() -> int:
-    """How many programs this module has compiled so far in this process; must not grow with the iterations."""
-    compiled: tuple[Any, ...] = (_simulate, _evaluate, _act)
-    return sum(function._cache_size() for function in compiled)
-
-
 def _checked(env: gymnasium.Env, policy: Any, key: Any, episodes: Any, max_steps: int | None) -> int:
     if not callable(getattr(policy, "sample", None)):
         raise ValueError(f"policy: expected an object with sample(key, observation), got {type(policy).__name__}")
     if not isinstance(key, jax.Array):
         raise ValueError(f"key: expected a JAX random key, got {type(key).__name__}")
-    if isinstance(episodes, bool) or not isinstance(episodes, int | np.integer) or episodes < 1:
-        raise ValueError(f"episodes: expected an integer ≥ 1, got {episodes!r}")
+    whole("episodes", episodes)
     return step_limit(env, max_steps)
 
 
@@ -144,19 +153,19 @@ def _layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
     yield env
 
 
-def _pure_dynamics(env: gymnasium.Env, policy: Any) -> FuncEnv | None:
-    """The pure functions, if nothing between them and the caller changes what they mean (a user's wrapper might)."""
+def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
+    """The pure functions, unless something around them may change what they mean, as a user's wrapper might."""
     *wrappers, inner = _layers(env)
     dynamics = getattr(inner, "dynamics", None)
     harmless = all(isinstance(layer, TimeLimit | OrderEnforcing | PassiveEnvChecker) for layer in wrappers)
     return dynamics if isinstance(dynamics, FuncEnv) and harmless and _is_pytree(policy) else None
 
 
-def _is_pytree(policy: Any) -> bool:
+def _is_pytree(policy: Sampler) -> bool:
     return all(isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int) for leaf in jax.tree.leaves(policy))
 
 
-def _first_not_finite(observations: np.ndarray, rewards: np.ndarray) -> int:
+def _first_not_finite(observations: Shaped[np.ndarray, "n t1 ..."], rewards: Float[np.ndarray, "n t"]) -> int:
     """The earliest bad step over all episodes; 0 is the reset."""
     bad = ~np.isfinite(observations).reshape(*observations.shape[:2], -1).all(axis=2)
     bad[:, 1:] |= ~np.isfinite(rewards)
@@ -170,18 +179,24 @@ def _not_finite(env: gymnasium.Env, step: int) -> str:
     )
 
 
-def _start(dynamics: FuncEnv, key: jax.Array) -> tuple[tuple[Any, Any, Any], jax.Array]:
+def _start(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Running, Key[Array, ""]]:
     start_key, steps_key = jax.random.split(key)
     state, observation = functional.reset(dynamics, start_key)
     return (state, _wide(dynamics, observation), jnp.asarray(True)), steps_key
 
 
 def _advance(
-    dynamics: FuncEnv, policy: Any, running: tuple[Any, Any, Any], steps_key: jax.Array, t: Any, drawn: Any = None
-) -> Any:
-    """One step of one episode; an episode that has ended stays as it is and earns nothing.
+    dynamics: FuncEnv,
+    policy: Sampler,
+    running: Running,
+    steps_key: Key[Array, ""],
+    t: Int[AnyArray, ""],
+    drawn: Int[Array, ""] | None = None,
+) -> tuple[Running, tuple[Shaped[Array, "..."], Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]]:
+    """One step of one episode: how it goes on, and action, reward, whether it terminated, whether it was running.
 
-    `drawn` is the step whose chance the action shares; its own when None.
+    An episode that has ended stays as it is and earns nothing. The action draws the noise of step `drawn`; of its own
+    when None.
     """
     state, observation, alive = running
     action_key, transition_key = jax.random.split(jax.random.fold_in(steps_key, t))
@@ -190,7 +205,7 @@ def _advance(
     action = _clipped(dynamics.action_space, policy.sample(action_key, observation))
     next_state, next_observation, reward, terminated = functional.step(dynamics, transition_key, state, action)
 
-    def kept(new: Any, old: Any) -> Any:
+    def kept(new: AnyArray, old: Array) -> Array:
         return jnp.where(alive, new, old).astype(old.dtype)
 
     next_state = jax.tree.map(kept, next_state, jax.tree.map(jnp.asarray, state))
@@ -201,13 +216,17 @@ def _advance(
 
 
 @partial(jax.jit, static_argnames=("dynamics", "episodes", "steps"), compiler_options=_COMPILER)
-def _simulate(dynamics: FuncEnv, policy: Any, key: jax.Array, hold: Any, *, episodes: int, steps: int) -> Any:
-    def episode(key: jax.Array) -> Any:
+def _simulate(
+    dynamics: FuncEnv, policy: Sampler, key: Key[Array, ""], hold: int, *, episodes: int, steps: int
+) -> tuple[Array, ...]:
+    """Observations, actions, rewards, whether it terminated and length of each episode."""
+
+    def episode(key: Key[Array, ""]) -> tuple[Array, ...]:
         running, steps_key = _start(dynamics, key)
         first = running[1]
         phase = jax.random.randint(jax.random.fold_in(steps_key, _PHASE), (), 0, hold)
 
-        def scan_step(running: Any, t: Any) -> Any:
+        def scan_step(running: Running, t: Int[Array, ""]) -> tuple[Running, tuple[Array, ...]]:
             drawn = jnp.maximum((t + phase) // hold * hold - phase, 0)
             running, outcome = _advance(dynamics, policy, running, steps_key, t, drawn)
             return running, (running[1], *outcome)
@@ -219,19 +238,21 @@ def _simulate(dynamics: FuncEnv, policy: Any, key: jax.Array, hold: Any, *, epis
 
 
 @partial(jax.jit, static_argnames=("dynamics", "episodes"), compiler_options=_COMPILER)
-def _evaluate(dynamics: FuncEnv, policy: Any, key: jax.Array, steps: Any, *, episodes: int) -> Any:
+def _evaluate(
+    dynamics: FuncEnv, policy: Sampler, key: Key[Array, ""], steps: int, *, episodes: int
+) -> tuple[Array, ...]:
     """Sums instead of trajectories, in a loop that stops once every episode has ended; new `steps` compile nothing."""
     running, steps_keys = jax.vmap(partial(_start, dynamics))(jax.random.split(key, episodes))
     advance = jax.vmap(partial(_advance, dynamics, policy), in_axes=(0, 0, None))
 
-    def loop_step(carry: Any) -> Any:
+    def loop_step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         t, (state, observation, alive), total, length, terminated, finite = carry
         (state, observation, still), (_, reward, ended, _) = advance((state, observation, alive), steps_keys, t)
         finite &= jnp.isfinite(reward) & jnp.isfinite(observation.reshape(episodes, -1)).all(axis=1)
         length = length + alive
         return t + 1, (state, observation, still & finite), total + reward, length, terminated | ended, finite
 
-    def goes_on(carry: Any) -> Any:
+    def goes_on(carry: tuple[Any, ...]) -> Bool[Array, ""]:
         return (carry[0] < steps) & carry[1][2].any()
 
     none = jnp.zeros(episodes, bool)
@@ -241,11 +262,11 @@ def _evaluate(dynamics: FuncEnv, policy: Any, key: jax.Array, steps: Any, *, epi
     return jax.lax.while_loop(goes_on, loop_step, carry)[2:]
 
 
-def _wide(dynamics: FuncEnv, observation: Any) -> jax.Array:
+def _wide(dynamics: FuncEnv, observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
     return jnp.asarray(observation).astype(float if isinstance(dynamics.observation_space, Box) else int)
 
 
-def _clipped(space: Any, action: Any) -> jax.Array:
+def _clipped(space: gymnasium.Space[Any], action: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
     if not isinstance(space, Box):
         return jnp.asarray(action).astype(int)
     low, high = np.asarray(space.low, float), np.asarray(space.high, float)
@@ -253,25 +274,35 @@ def _clipped(space: Any, action: Any) -> jax.Array:
 
 
 @jax.jit
-def _act(policy: Any, key: jax.Array, counter: Any, observations: jax.Array) -> jax.Array:
+def _act(
+    policy: Sampler, key: Key[Array, ""], counter: int, observations: Shaped[AnyArray, "n ..."]
+) -> Shaped[Array, "n ..."]:
     keys = jax.random.split(jax.random.fold_in(key, counter), len(observations))
     return jax.vmap(policy.sample)(keys, observations)
 
 
-def _act_one_by_one(policy: Any, key: jax.Array, counter: int, observations: np.ndarray) -> np.ndarray:
+def _act_one_by_one(
+    policy: Sampler, key: Key[Array, ""], counter: int, observations: Shaped[np.ndarray, "n ..."]
+) -> Shaped[np.ndarray, "n ..."]:
     """For a policy that is an ordinary Python object."""
     keys = jax.random.split(jax.random.fold_in(key, counter), len(observations))
     return np.stack([np.asarray(policy.sample(*pair)) for pair in zip(keys, observations, strict=True)])
 
 
 def _by_interface(
-    env: gymnasium.Env, policy: Any, key: jax.Array, episodes: int, steps: int, explicit: bool, hold: int = 1
+    env: gymnasium.Env,
+    policy: Sampler,
+    key: Key[Array, ""],
+    episodes: int,
+    steps: int,
+    explicit: bool,
+    hold: int = 1,
 ) -> Iterator[Trajectory]:
     seed_key, policy_key = jax.random.split(key)
     seed = int(jax.random.randint(seed_key, (), 0, 2**30))
     choose = _act if _is_pytree(policy) else _act_one_by_one
 
-    def act(counter: int, observations: np.ndarray) -> np.ndarray:
+    def act(counter: int, observations: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, "n ..."]:
         with jax.enable_x64(True):
             actions = np.asarray(choose(policy, policy_key, counter // hold, observations))
         if not np.isfinite(actions).all():

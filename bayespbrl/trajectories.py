@@ -4,6 +4,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from bayespbrl.checks import finite
 
 
 @dataclass(frozen=True, repr=False)
@@ -13,16 +16,16 @@ class Trajectory:
     Attributes:
       states: s₀ … s_T as observed; shape (T+1, S) float64, or (T+1,) int64 where observations are discrete.
       actions: a₀ … a_{T−1}; shape (T, A) float64, or (T,) int64 where actions are discrete.
-      rewards: the environment's hidden reward of each step, shape (T,). Only experts and evaluation read it.
+      rewards: the environment's hidden reward of each step. Only experts and evaluation read it.
       terminated: whether s_T is terminal (a time limit is not).
 
     Raises:
       ValueError: lengths that do not fit together, or an entry that is not finite.
     """
 
-    states: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
+    states: Shaped[np.ndarray, "t1 ..."]
+    actions: Shaped[np.ndarray, "t ..."]
+    rewards: Float[np.ndarray, " t"]
     terminated: bool = False
 
     def __post_init__(self) -> None:
@@ -35,8 +38,7 @@ class Trajectory:
                 f"{steps} actions and {len(self.rewards)} rewards"
             )
         for name in ("states", "actions", "rewards"):
-            if not np.all(np.isfinite(getattr(self, name))):
-                raise ValueError(f"trajectory: {name} must be finite, got NaN or infinity")
+            finite(f"trajectory: {name}", getattr(self, name))
 
     def __repr__(self) -> str:
         return f"Trajectory(steps={len(self)}, terminated={self.terminated})"
@@ -57,15 +59,15 @@ class Transitions:
 
     Attributes:
       states, actions, next_states: shapes (N, S), (N, A), (N, S), or (N,) where discrete.
-      rewards: hidden reward, shape (N,).
-      terminal: whether sᵢ′ is terminal, shape (N,) bool.
+      rewards: hidden reward.
+      terminal: whether sᵢ′ is terminal.
     """
 
-    states: np.ndarray
-    actions: np.ndarray
-    next_states: np.ndarray
-    rewards: np.ndarray
-    terminal: np.ndarray
+    states: Shaped[np.ndarray, "n ..."]
+    actions: Shaped[np.ndarray, "n ..."]
+    next_states: Shaped[np.ndarray, "n ..."]
+    rewards: Float[np.ndarray, " n"]
+    terminal: Bool[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -86,16 +88,19 @@ def transitions(trajectories: Sequence[Trajectory]) -> Transitions:
 
 
 def trajectory_features(
-    trajectories: Sequence[Trajectory], features: Callable[[np.ndarray], np.ndarray], *, discount: float
-) -> np.ndarray:
-    """ψ(τ) = Σₜ γᵗ φ(sₜ₊₁), t = 0 … T−1, of each trajectory; shape (n, D).
+    trajectories: Sequence[Trajectory],
+    features: Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]],
+    *,
+    discount: float,
+) -> Float[np.ndarray, "m d"]:
+    """ψ(τ) = Σₜ γᵗ φ(sₜ₊₁), t = 0 … T−1, of each trajectory.
 
-    Decision: features of the *next* state, as in the authors' published implementation and as in LSTD here (eq. 1
-    sums from s₀, which no choice of the policy can change).
+    Decision: features of the *next* state, as in the authors' published implementation and as in LSTD here. The paper
+    (eq. 1) sums from s₀, which no choice of the policy can change.
 
     Args:
-      trajectories: n of them, of any lengths.
-      features: φ, from (N, S) states to (N, D).
+      trajectories: of any lengths.
+      features: φ(s).
       discount: γ in [0, 1].
     """
     if not trajectories:
@@ -103,4 +108,4 @@ def trajectory_features(
     table = features(np.concatenate([t.states[1:] for t in trajectories]))
     discounts = np.concatenate([discount ** np.arange(len(t)) for t in trajectories])
     starts = np.cumsum([0] + [len(t) for t in trajectories[:-1]])
-    return np.add.reduceat(table * discounts[:, None], starts, axis=0)
+    return np.add.reduceat(table * discounts[:, None], starts, axis=0)  # eq. 1

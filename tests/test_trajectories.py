@@ -79,5 +79,5 @@ def test_a_trajectory_without_steps_or_of_lengths_that_do_not_fit_is_refused():
 def test_what_is_not_finite_is_refused_by_name(name, bad):
     parts = {"states": np.zeros((3, 2)), "actions": np.zeros((2, 1)), "rewards": np.zeros(2)}
     parts[name][-1] = bad
-    with pytest.raises(ValueError, match=f"{name} must be finite"):
+    with pytest.raises(ValueError, match=f"trajectory: {name}: expected finite entries, got NaN or infinity"):
         Trajectory(**parts)

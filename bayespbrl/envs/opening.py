@@ -14,17 +14,19 @@ from gymnasium.wrappers import TransformAction, TransformObservation
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.envs.functional import FunctionalEnv
 
+AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
+
 # Environments that we made from an id, and that can therefore be made again, N at a time.
 _MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
-# What `flattened` was given, where it had something to do.
+# What `flattened` wrapped.
 _GIVEN: WeakKeyDictionary[gymnasium.Env, gymnasium.Env] = WeakKeyDictionary()
 
 
-def open_environment(environment: str | EnvSpec | gymnasium.Env | FuncEnv) -> gymnasium.Env:
+def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
     """The environment behind a short name, a gymnasium id or spec, an environment object or pure functions.
 
-    The result has 1-D `Box` spaces or `Discrete` spaces counted from 0 (**decision**: other shapes are flattened, other
-    starts are shifted, by wrappers that undo it on the way in), so that policies and features meet nothing else.
+    The result has 1-D `Box` spaces or `Discrete` spaces counted from 0, so that policies and features meet nothing
+    else. Decision: other shapes are flattened and other starts shifted, by wrappers that undo it on the way in.
     Opening what is already open gives the same object back.
 
     Raises:
@@ -46,7 +48,7 @@ def open_environment(environment: str | EnvSpec | gymnasium.Env | FuncEnv) -> gy
 
 
 def made_from(env: gymnasium.Env) -> EnvSpec | None:
-    """The spec from which `open_environment` made `env`; None for an object of the user's: there is only one of it."""
+    """The spec from which `open_environment` made `env`; None for a user's object, of which there is only one."""
     return _MADE_FROM.get(env)
 
 
@@ -59,8 +61,10 @@ def environment_name(env: gymnasium.Env) -> str:
 
 
 def given_by_name(environment: Any) -> bool:
-    """Whether the name alone opens the same again: not so what was made with other arguments, wrapped, or registered
-    nowhere."""
+    """Whether the name alone opens the same environment again.
+
+    It does not for an environment that was made with other arguments, wrapped, or never registered.
+    """
     if isinstance(environment, str):
         return True
     spec = environment if isinstance(environment, EnvSpec) else getattr(environment, "spec", None)
@@ -75,7 +79,7 @@ def given_by_name(environment: Any) -> bool:
 
 
 def _same(first: Any, second: Any) -> bool:
-    """Whether two arguments are equal, arrays too; not so where that cannot be told."""
+    """Whether two arguments are equal, arrays too; False where they cannot be compared."""
     try:
         return bool(np.array_equal(first, second) if isinstance(first, np.ndarray) else first == second)
     except ValueError:
@@ -83,7 +87,7 @@ def _same(first: Any, second: Any) -> bool:
 
 
 def environment_attribute(env: gymnasium.Env, name: str) -> Any:
-    """What an environment's pure functions tell beyond gymnasium, `optimal_return` or `grid_shape`; None if nothing."""
+    """An attribute that the environment's dynamics have beyond gymnasium's, as `optimal_return`; None without it."""
     return getattr(getattr(env.unwrapped, "dynamics", None), name, None)
 
 
@@ -115,7 +119,7 @@ def _one_line(error: Exception) -> str:
 
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
-    """`env` with 1-D `Box` spaces and `Discrete` spaces counted from 0; `env` itself where nothing is to be done."""
+    """`env` with 1-D `Box` spaces and `Discrete` spaces counted from 0; `env` itself where it has them already."""
     given, observations, actions = env, env.observation_space, env.action_space
     for kind, space in (("observation", observations), ("action", actions)):
         if not isinstance(space, Box | Discrete) or (
@@ -135,7 +139,7 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
 
 
 def as_given(env: gymnasium.Env) -> gymnasium.Env:
-    """The environment that `flattened` made `env` of: the user's, with the spaces that it really has."""
+    """The user's environment that `flattened` wrapped, with its own spaces; `env` itself where it wrapped nothing."""
     return _GIVEN.get(env, env)
 
 
@@ -148,10 +152,10 @@ def _plain_space(space: Any) -> Any:
 
 
 def to_plain(space: Any, value: Any) -> Any:
-    """An observation or action of `space` as the flattened environment has it."""
+    """An observation or action of `space`, flattened."""
     return np.reshape(value, -1) if isinstance(space, Box) else np.int64(value - space.start)
 
 
 def from_plain(space: Any, value: Any) -> Any:
-    """The way back of `to_plain`."""
+    """The inverse of `to_plain`."""
     return np.reshape(value, space.shape) if isinstance(space, Box) else np.int64(value + space.start)

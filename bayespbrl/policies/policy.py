@@ -11,8 +11,16 @@ from numpy.typing import ArrayLike
 AnyArray = Array | np.ndarray  # a policy holds NumPy's arrays, within a trace JAX's
 
 
+class Sampler(Protocol):
+    """What a rollout needs of a policy."""
+
+    def sample(self, key: Key[Array, ""], observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
+        """One action for one observation. Continuous actions are not clipped: the environment does that."""
+        ...
+
+
 @runtime_checkable
-class Policy(Protocol):
+class Policy(Sampler, Protocol):
     """A stochastic policy: a frozen dataclass, registered as a JAX pytree, whose shapes stay fixed for a whole run.
 
     The methods that take a single observation are JAX-traceable, so that a rollout compiled once takes any policy of
@@ -28,10 +36,6 @@ class Policy(Protocol):
 
         `ValueError` where the spaces do not suit this kind of policy.
         """
-        ...
-
-    def sample(self, key: Key[Array, ""], observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
-        """One action for one observation. Continuous actions are not clipped: the environment does that."""
         ...
 
     def log_prob(self, observation: Shaped[AnyArray, "..."], action: Shaped[AnyArray, "..."]) -> Float[Array, ""]:
