@@ -9,13 +9,18 @@ kernel matrix into one matrix product.
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from bayespbrl import checks
+
+Vector = Float[Array, " s"] | Float[np.ndarray, " s"]
+Rows = Float[Array, "d s"] | Float[np.ndarray, "d s"]
 ROWS_AT_A_TIME = 1024  # keeps a block of a wide kernel matrix in the processor's cache between its three passes
 
 
-def as_periods(period: ArrayLike | None, dimension: int) -> np.ndarray:
-    """`period` as an array of shape (dimension,), all infinite for None. `ValueError` unless > 0."""
+def as_periods(period: ArrayLike | None, dimension: int) -> Float[np.ndarray, "{dimension}"]:
+    """`period` as an array, all infinite for None. `ValueError` unless there are `dimension` numbers > 0."""
     if period is None:
         return np.full(dimension, np.inf)
     periods = np.asarray(period, dtype=np.float64)
@@ -24,23 +29,25 @@ def as_periods(period: ArrayLike | None, dimension: int) -> np.ndarray:
     return periods
 
 
-def coordinates(points: np.ndarray, period: np.ndarray) -> np.ndarray:
-    """Points of shape (N, S) in the kernel's Euclidean coordinates: plain dimensions, then P/2π·cos, then P/2π·sin."""
+def coordinates(points: Float[np.ndarray, "n s"], period: Float[np.ndarray, " s"]) -> Float[np.ndarray, "n e"]:
+    """Points in the kernel's Euclidean coordinates: plain dimensions, then P/2π·cos, then P/2π·sin."""
     periodic = np.isfinite(period)
     radius = period[periodic] / (2 * np.pi)
     angles = points[:, periodic] / radius
     return np.concatenate([points[:, ~periodic], radius * np.cos(angles), radius * np.sin(angles)], axis=1)
 
 
-def inverse_bandwidths(bandwidths: np.ndarray, period: np.ndarray) -> np.ndarray:
+def inverse_bandwidths(bandwidths: Float[np.ndarray, " s"], period: Float[np.ndarray, " s"]) -> Float[np.ndarray, " e"]:
     """1/b for each of the `coordinates`; zero where the bandwidth is zero, which leaves the dimension out."""
     inverse = np.divide(1.0, bandwidths, out=np.zeros(len(bandwidths)), where=bandwidths > 0)
     periodic = np.isfinite(period)
     return np.concatenate([inverse[~periodic], inverse[periodic], inverse[periodic]])
 
 
-def squared_exponential(points: np.ndarray, centres: np.ndarray, *, normalised: bool = False) -> np.ndarray:
-    """exp(−½‖xᵢ − zⱼ‖²) of scaled coordinates (N, E) and (D, E), or that over its sum over j; shape (N, D)."""
+def squared_exponential(
+    points: Float[np.ndarray, "n e"], centres: Float[np.ndarray, "d e"], *, normalised: bool = False
+) -> Float[np.ndarray, "n d"]:
+    """exp(−½‖xᵢ − zⱼ‖²) of scaled coordinates, or that over its sum over j."""
     middle = centres.mean(axis=0)  # the expansion of the square cancels; near the origin it loses least
     points, centres = points - middle, centres - middle
     left = np.column_stack([points, -0.5 * np.square(points).sum(axis=1), np.ones(len(points))])
@@ -59,32 +66,32 @@ def squared_exponential(points: np.ndarray, centres: np.ndarray, *, normalised: 
 
 
 def radial_basis(
-    points: np.ndarray, centres: np.ndarray, bandwidths: np.ndarray, period: np.ndarray, *, normalised: bool = False
-) -> np.ndarray:
-    """k(xᵢ, zⱼ) for points (N, S) and centres (D, S), with bandwidths and period of shape (S,); shape (N, D).
-
-    With `normalised` each row is divided by its sum.
-    """
+    points: Float[np.ndarray, "n s"],
+    centres: Float[np.ndarray, "d s"],
+    bandwidths: Float[np.ndarray, " s"],
+    period: Float[np.ndarray, " s"],
+    *,
+    normalised: bool = False,
+) -> Float[np.ndarray, "n d"]:
+    """k(xᵢ, zⱼ) for points x and centres z; with `normalised` each row is divided by its sum."""
     scale = inverse_bandwidths(bandwidths, period)
     return squared_exponential(
         coordinates(points, period) * scale, coordinates(centres, period) * scale, normalised=normalised
     )
 
 
-def radial_basis_row(
-    point: Array, centres: Array | np.ndarray, bandwidths: Array | np.ndarray, period: Array | np.ndarray
-) -> Array:
-    """`radial_basis` of one point (S,), traceable by JAX; shape (D,)."""
+def radial_basis_row(point: Vector, centres: Rows, bandwidths: Vector, period: Vector) -> Float[Array, " d"]:
+    """`radial_basis` of one point, traceable by JAX."""
     bandwidths = jnp.asarray(bandwidths)
     inverse = jnp.where(bandwidths > 0, 1 / jnp.where(bandwidths > 0, bandwidths, 1.0), 0.0)
     difference = _on_circles(jnp.asarray(point), period) - _on_circles(jnp.asarray(centres), period)
     return jnp.exp(-0.5 * jnp.sum(jnp.square(difference * jnp.tile(inverse, 2)), axis=-1))
 
 
-def _on_circles(points: Array, period: Array | np.ndarray) -> Array:
-    """`coordinates` of shape (…, 2S), traceable: a plain dimension's second one is zero, whichever are periodic.
+def _on_circles(points: Float[Array, "*b s"], period: Vector) -> Float[Array, "*b e"]:
+    """`coordinates` with two for each dimension, traceable: the second one of a plain dimension is zero.
 
-    The centres' are the same for all points, so that no sine is taken of a difference.
+    Those of the centres are the same for all points, so that no sine is taken of a difference.
     """
     periodic = jnp.isfinite(period)
     radius = jnp.where(periodic, period, 1.0) / (2 * jnp.pi)  # no infinity inside: its gradient would be NaN
@@ -94,24 +101,25 @@ def _on_circles(points: Array, period: Array | np.ndarray) -> Array:
 
 
 def median_bandwidths(
-    points: np.ndarray,
+    points: ArrayLike,
     *,
     factor: float = 1.0,
     period: ArrayLike | None = None,
     rng: np.random.Generator,
     number_of_pairs: int = 4096,
-) -> np.ndarray:
-    """factor × sqrt(median over pairs of the squared difference), per dimension; specification's median rule.
+) -> Float[np.ndarray, " s"]:
+    """The median rule: factor × sqrt(median over pairs of the squared difference), per dimension.
 
-    The median is over `number_of_pairs` random pairs of rows of `points` (N, S), periodic differences wrapped. Where
-    more than half of the pairs agree the mean takes the median's place; only a constant dimension gets bandwidth zero.
-    Shape (S,), in the units of `points`.
+    The median is over random pairs of rows of `points` (N, S), periodic differences wrapped. Where more than half of
+    the pairs agree the mean takes the median's place; only a constant dimension gets bandwidth zero. The bandwidths are
+    in the units of `points`.
+
+    Raises:
+      ValueError: points that are no finite matrix with rows, a factor or a period that is not > 0.
     """
-    if not factor > 0:
-        raise ValueError(f"factor: expected a number > 0, got {factor}")
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or len(points) == 0 or not np.isfinite(points).all():
-        raise ValueError(f"points: expected finite numbers of shape (N, S), N ≥ 1, got shape {points.shape}")
+    factor, points = checks.positive("factor", factor), checks.matrix("points", points)
+    if len(points) == 0:
+        raise ValueError(f"points: expected shape (N >= 1, S), got {points.shape}")
     periods = as_periods(period, points.shape[1])
     if len(points) == 1:
         return np.zeros(points.shape[1])

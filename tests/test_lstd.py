@@ -1,9 +1,13 @@
 import numpy as np
 import pytest
 
-from bayespbrl.improvement.lstd import lstd_q, solve_lstd, transition_sums
+from bayespbrl.improvement.lstd import solve_lstd, transition_sums
 
 NO_PENALTY = {"fixed_point_ridge": 0.0, "projection_ridge": 0.0}
+
+
+def lstd(features, following, utilities, **options):
+    return solve_lstd(transition_sums(features, following, utilities), **options)
 
 
 def chain_features(length):
@@ -16,13 +20,13 @@ def test_lstd_on_a_chain_solves_the_bellman_equation():
     features, following = chain_features(6)
     rewards = np.array([0.5, -1.0, 2.0, 0.0, 3.0, 1.0])
     expected = np.linalg.solve(np.eye(6) - 0.9 * following, rewards)  # (I − γP)⁻¹ r
-    np.testing.assert_allclose(lstd_q(features, following, rewards, discount=0.9, **NO_PENALTY), expected, atol=1e-9)
+    np.testing.assert_allclose(lstd(features, following, rewards, discount=0.9, **NO_PENALTY), expected, atol=1e-9)
 
 
 def test_a_terminal_successor_is_worth_nothing():
     features = np.eye(2)
     following = np.array([[0.0, 1.0], [0.0, 0.0]])
-    weights = lstd_q(features, following, np.array([1.0, 4.0]), discount=0.5, **NO_PENALTY)
+    weights = lstd(features, following, np.array([1.0, 4.0]), discount=0.5, **NO_PENALTY)
     np.testing.assert_allclose(weights, [3.0, 4.0])
 
 
@@ -33,7 +37,7 @@ def test_discount_zero_is_ridge_regression_on_the_projected_target():
     gram = features.T @ features
     projected = features @ np.linalg.solve(gram + 0.7 * np.eye(5), features.T @ utilities)
     expected = np.linalg.solve(gram + 0.3 * np.eye(5), features.T @ projected)
-    weights = lstd_q(features, following, utilities, discount=0.0, fixed_point_ridge=0.3, projection_ridge=0.7)
+    weights = lstd(features, following, utilities, discount=0.0, fixed_point_ridge=0.3, projection_ridge=0.7)
     np.testing.assert_allclose(weights, expected, atol=1e-12)
 
 
@@ -45,7 +49,7 @@ def test_penalised_weights_equal_the_formula_with_the_projection_written_out():
     design = features - 0.8 * features @ projection @ following
     target = features @ projection @ utilities
     expected = np.linalg.solve(design.T @ design + 0.1 * np.eye(4), design.T @ target)
-    weights = lstd_q(features, following, utilities, discount=0.8, fixed_point_ridge=0.1, projection_ridge=0.2)
+    weights = lstd(features, following, utilities, discount=0.8, fixed_point_ridge=0.1, projection_ridge=0.2)
     np.testing.assert_allclose(weights, expected, atol=1e-10)
 
 
@@ -57,7 +61,7 @@ def test_the_sums_of_two_blocks_are_those_of_all_transitions():
     first, second = (
         transition_sums(features[rows], following[rows], utilities[rows]) for rows in (slice(11), slice(11, None))
     )
-    expected = lstd_q(features, following, utilities, **options)
+    expected = lstd(features, following, utilities, **options)
     np.testing.assert_allclose(solve_lstd(first + second, **options), expected, atol=1e-12)
     assert np.abs(solve_lstd(first, **options) - expected).max() > 1e-3
 
@@ -65,7 +69,7 @@ def test_the_sums_of_two_blocks_are_those_of_all_transitions():
 def test_features_that_never_occur_get_weight_zero():
     features, following = chain_features(3)
     padded = [np.column_stack([block, np.zeros(3)]) for block in (features, following)]
-    weights = lstd_q(*padded, np.ones(3), discount=0.5, **NO_PENALTY)
+    weights = lstd(*padded, np.ones(3), discount=0.5, **NO_PENALTY)
     np.testing.assert_allclose(weights, [2.0, 2.0, 2.0, 0.0], atol=1e-9)
 
 
@@ -75,19 +79,19 @@ def test_utilities_side_by_side_give_the_weights_of_each_alone(unseen):
     features, following = (np.pad(rng.normal(size=(30, 4)), [(0, 0), (0, unseen)]) for _ in range(2))
     utilities = rng.normal(size=(30, 3))
     options = {"discount": 0.8, "fixed_point_ridge": 0.0, "projection_ridge": 0.0}
-    together = lstd_q(features, following, utilities, **options)
-    alone = [lstd_q(features, following, column, **options) for column in utilities.T]
+    together = lstd(features, following, utilities, **options)
+    alone = [lstd(features, following, column, **options) for column in utilities.T]
     assert together.shape == (4 + unseen, 3)
     np.testing.assert_allclose(together, np.column_stack(alone), atol=1e-10)
     mixture = np.array([0.5, -2.0, 1.0])
     np.testing.assert_allclose(
-        together @ mixture, lstd_q(features, following, utilities @ mixture, **options), atol=1e-10
+        together @ mixture, lstd(features, following, utilities @ mixture, **options), atol=1e-10
     )
 
 
 def test_the_weights_of_one_hot_utilities_on_a_chain_are_the_discounted_visits_to_come():
     features, following = chain_features(5)
-    visits = lstd_q(features, following, np.eye(5), discount=0.9, **NO_PENALTY)
+    visits = lstd(features, following, np.eye(5), discount=0.9, **NO_PENALTY)
     np.testing.assert_allclose(visits, np.linalg.inv(np.eye(5) - 0.9 * following), atol=1e-9)  # (I − γP)⁻¹
 
 
@@ -107,4 +111,4 @@ def test_bad_input_is_named(changes, message):
     features, following = chain_features(3)
     arguments = {"utilities": np.ones(3), "discount": 0.5, **NO_PENALTY} | changes
     with pytest.raises(ValueError, match=message):
-        lstd_q(features, following, **arguments)
+        lstd(features, following, **arguments)

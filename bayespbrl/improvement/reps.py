@@ -1,14 +1,22 @@
 """Actor-critic REPS: sample weights that raise Q within a KL bound (paper, step 2, eqs. 11-13)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from jaxtyping import Float, Int, Shaped
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
+from bayespbrl import checks
+
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
+RANK_TOLERANCE = 1e-3
 ITERATIONS = 500  # cap of the solver; some twenty are usual
+CONSTANT = "constant Q: nothing to gain"
 
 
 @dataclass(frozen=True)
@@ -16,60 +24,66 @@ class RepsSolution:
     """Solution of the REPS dual and how well it meets its two conditions.
 
     Attributes:
-      sample_weights: wᵢ = pᵢ/Wᵢ for the weighted fit of eq. 14, mean 1 under W, shape (N,).
-      probabilities: pᵢ of eq. 12, shape (N,), sum 1.
-      value_weights: v with V(s) = vᵀφ(s), in the units of Q, shape (D,).
+      sample_weights: wᵢ = pᵢ/Wᵢ for the weighted fit of eq. 14, mean 1 under W.
+      probabilities: pᵢ of eq. 12, sum 1.
+      value_weights: v with V(s) = vᵀφ(s), in the units of Q.
       temperature: η in the units of Q.
       kl: KL(p‖W) in nats.
       kl_bound: ε that was asked for, in nats.
-      bound_active: whether the bound holds with equality; where it does not, no admissible p is that far from W.
       feature_gap: largest |Σ pᵢφᵢ − φ̂| in the whitened features.
       feature_gap_raw: the same in the features as given, the dropped directions among them.
       rank_kept: number of whitened directions.
-      effective_samples: Kish's 1/Σ pᵢ².
       converged: whether the solver met its tolerance.
-      status: the solver's own word.
+      status: the solver's message.
     """
 
-    sample_weights: np.ndarray
-    probabilities: np.ndarray
-    value_weights: np.ndarray
+    sample_weights: Float[np.ndarray, " n"]
+    probabilities: Float[np.ndarray, " n"]
+    value_weights: Float[np.ndarray, " d"]
     temperature: float
     kl: float
     kl_bound: float
-    bound_active: bool
     feature_gap: float
     feature_gap_raw: float
     rank_kept: int
-    effective_samples: float
     converged: bool
     status: str
+
+    @property
+    def bound_active(self) -> bool:
+        """Whether the bound holds with equality; otherwise no admissible p is that far from W."""
+        return bool(abs(self.kl - self.kl_bound) <= 0.01 * self.kl_bound)
+
+    @property
+    def effective_samples(self) -> float:
+        """Kish's 1/Σ pᵢ²."""
+        return float(1 / np.sum(self.probabilities**2))
 
 
 @dataclass(frozen=True)
 class WhitenedFeatures:
-    """Features of the constraint, centred and of unit variance under W, which no bound changes.
+    """Features of the constraint, centred and of unit variance under W. They do not depend on the bound.
 
     Attributes:
-      features: shape (N, r).
-      mapping: from the centred features as given to these, shape (D, r).
+      features: those that are kept.
+      mapping: from the centred features as given to these.
     """
 
-    features: np.ndarray
-    mapping: np.ndarray
+    features: Float[np.ndarray, "n r"]
+    mapping: Float[np.ndarray, "d r"]
 
 
-def whitened(state_features: np.ndarray, base_weights: np.ndarray, *, rank_tolerance: float = 1e-3) -> WhitenedFeatures:
-    """Features (N, D) whitened under W, (N,); directions below `rank_tolerance` of the largest singular value go.
+def whitened(state_features: Float[np.ndarray, "n d"], base_weights: Float[np.ndarray, " n"]) -> WhitenedFeatures:
+    """Features whitened under W, without directions below `RANK_TOLERANCE` of the largest singular value.
 
     Raises:
       ValueError: entries that are not finite.
     """
-    _check_finite("state_features", state_features)
+    checks.finite("state_features", state_features)
     centred = state_features - base_weights @ state_features
     covariance = centred.T @ (centred * base_weights[:, None])
     values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
-    keep = values > max(values[-1], 0.0) * rank_tolerance**2
+    keep = values > max(values[-1], 0.0) * RANK_TOLERANCE**2
     if not np.any(keep) or values[-1] <= 1e-24:
         return WhitenedFeatures(np.zeros((len(centred), 0)), np.zeros((centred.shape[1], 0)))
     mapping = vectors[:, keep] / np.sqrt(values[keep])
@@ -77,17 +91,17 @@ def whitened(state_features: np.ndarray, base_weights: np.ndarray, *, rank_toler
 
 
 def reps_weights(
-    q_values: np.ndarray,
-    state_features: np.ndarray,
-    base_weights: np.ndarray,
+    q_values: ArrayLike,
+    state_features: ArrayLike,
+    base_weights: ArrayLike,
     *,
     kl_bound: float,
     constraint: WhitenedFeatures | None = None,
 ) -> RepsSolution:
     """Maximise Σ pᵢQᵢ subject to KL(p‖W) ≤ ε and Σ pᵢφᵢ = φ̂ by the dual of eq. 13.
 
-    The dual in raw radial basis features is hopelessly ill-conditioned, so the features are whitened and Q is
-    standardised; then CasADi's IPOPT with limited-memory Hessian needs some twenty iterations.
+    The dual in raw radial basis features is ill-conditioned, so the features are whitened and Q is standardised.
+    CasADi's IPOPT with limited-memory Hessian then needs some twenty iterations.
 
     Args:
       q_values: Qᵢ, shape (N,).
@@ -102,45 +116,41 @@ def reps_weights(
 
     Source: paper, eqs. 11-13; Daniel, Neumann and Peters (2012) for the feature constraint.
     """
-    _check(q_values, state_features, base_weights, kl_bound)
-    constraint = whitened(state_features, base_weights) if constraint is None else constraint
+    q, phi, base = _checked(q_values, state_features, base_weights, kl_bound)
+    constraint = whitened(phi, base) if constraint is None else constraint
     features = constraint.features
-    mean = base_weights @ q_values
-    spread = np.sqrt(base_weights @ (q_values - mean) ** 2)
+    mean = base @ q
+    spread = np.sqrt(base @ (q - mean) ** 2)
     # what LSTD's penalties leave of a constant Q is noise, and must not be blown up to the size of the bound
-    scale, temperature, converged, status = 1.0, 1.0, True, "constant Q: nothing to gain"
-    standardised, dual = np.zeros_like(q_values), np.zeros(features.shape[1])  # the weights that change nothing
+    scale, temperature, converged, status = 1.0, 1.0, True, CONSTANT
+    standardised, dual = np.zeros_like(q), np.zeros(features.shape[1])  # the weights that change nothing
     if spread > 1e-8 * np.abs(mean):
         scale = spread
-        scaled = (q_values - mean) / scale
-        reached, multipliers, converged, status = _solve_dual(scaled, features, base_weights, kl_bound)
+        scaled = (q - mean) / scale
+        reached, multipliers, converged, status = _solve_dual(scaled, features, base, kl_bound)
         if converged:  # what an unfinished solver leaves is no update: stay where we are, and say so
             temperature, dual, standardised = reached, multipliers, scaled
-    logits = np.log(base_weights) + (standardised - features @ dual) / temperature  # (eq. 12)
+    logits = np.log(base) + (standardised - features @ dual) / temperature  # eq. 12
     probabilities = np.exp(logits - np.max(logits))
     probabilities /= np.sum(probabilities)
-    ratio = probabilities / base_weights
     positive = probabilities > 0
-    kl = float(probabilities[positive] @ np.log(ratio[positive]))
     return RepsSolution(
-        sample_weights=ratio,  # mean Σ W·p/W = 1 by construction
+        sample_weights=probabilities / base,  # mean Σ W·p/W = 1 by construction
         probabilities=probabilities,
         value_weights=scale * (constraint.mapping @ dual),
         temperature=scale * temperature,
-        kl=kl,
+        kl=float(probabilities[positive] @ np.log((probabilities / base)[positive])),
         kl_bound=kl_bound,
-        bound_active=bool(abs(kl - kl_bound) <= 0.01 * kl_bound),
         feature_gap=float(np.max(np.abs(probabilities @ features), initial=0.0)),
-        feature_gap_raw=float(np.max(np.abs((probabilities - base_weights) @ state_features), initial=0.0)),
+        feature_gap_raw=float(np.max(np.abs((probabilities - base) @ phi), initial=0.0)),
         rank_kept=features.shape[1],
-        effective_samples=float(1 / np.sum(probabilities**2)),
         converged=converged,
         status=status,
     )
 
 
 def reps_weights_by_state(
-    q_values: np.ndarray, states: np.ndarray, base_weights: np.ndarray, *, kl_bound: float
+    q_values: ArrayLike, states: ArrayLike, base_weights: ArrayLike, *, kl_bound: float
 ) -> RepsSolution:
     """Maximise Σ pᵢQᵢ subject to KL(p‖W) ≤ ε and p(s) = W(s) for every single state: `reps_weights` with one-hot φ.
 
@@ -158,66 +168,79 @@ def reps_weights_by_state(
 
     Source: paper, eqs. 11-13, in the limit of features that tell all states apart.
     """
-    _check(q_values, states, base_weights, kl_bound)
-    visits = np.bincount(states, weights=base_weights)
+    q, states, base = _checked(q_values, states, base_weights, kl_bound)
+    visits = np.bincount(states, weights=base)
     if np.any(visits == 0):
         raise ValueError(f"states: expected each of 0 … {len(visits) - 1}, got none of {np.argmin(visits)}")
-    logarithms = np.log(base_weights / visits[states])  # log q(a|s)
-    means = np.bincount(states, weights=base_weights * q_values) / visits
-    spread = np.sqrt(base_weights @ (q_values - means[states]) ** 2)
-    constant = not spread > 1e-8 * np.max(np.abs(q_values))
-    scaled = np.zeros_like(q_values) if constant else (q_values - means[states]) / spread
-
-    def solution(temperature: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """p(a|s), V(s) less the mean of Q there, in standard deviations of Q, and KL."""
-        logits = logarithms + scaled / temperature
-        highest = np.full(len(visits), -np.inf)
-        np.maximum.at(highest, states, logits)
-        normaliser = highest + np.log(np.bincount(states, weights=np.exp(logits - highest[states])))
-        logits = logits - normaliser[states]
-        chances = np.exp(logits)
-        return chances, temperature * normaliser, float((visits[states] * chances) @ (logits - logarithms))
-
-    low, high = TEMPERATURE_FLOOR, 1.0
-    if constant or solution(low)[2] <= kl_bound:
-        temperature = 1.0 if constant else low
-    else:
-        while solution(high)[2] > kl_bound:  # at most a few dozen times: KL falls as 1/η²
-            high *= 10
-
-        def excess(logarithm: float) -> float:
-            return solution(float(np.exp(logarithm)))[2] - kl_bound
-
-        temperature = float(np.exp(brentq(excess, np.log(low), np.log(high), xtol=1e-12)))
-    chances, values, kl = solution(temperature)
+    means = np.bincount(states, weights=base * q) / visits
+    spread = np.sqrt(base @ (q - means[states]) ** 2)
+    constant = not spread > 1e-8 * np.max(np.abs(q))
+    scaled = np.zeros_like(q) if constant else (q - means[states]) / spread
+    logarithms = np.log(base / visits[states])
+    by_state = partial(_exponential, logarithms=logarithms, q_values=scaled, states=states, visits=visits)
+    temperature = 1.0 if constant else _temperature(lambda eta: by_state(eta)[2], kl_bound)
+    chances, values, kl = by_state(temperature)
     probabilities = visits[states] * chances
     gap = float(np.max(np.abs(np.bincount(states, weights=probabilities) - visits)))
     return RepsSolution(
-        sample_weights=probabilities / base_weights,
+        sample_weights=probabilities / base,
         probabilities=probabilities,
         value_weights=means if constant else means + spread * values,
         temperature=1.0 if constant else float(spread * temperature),
         kl=kl,
         kl_bound=kl_bound,
-        bound_active=bool(abs(kl - kl_bound) <= 0.01 * kl_bound),
         feature_gap=gap,
         feature_gap_raw=gap,
         rank_kept=int(np.sum(visits > 0)) - 1,
-        effective_samples=float(1 / np.sum(probabilities**2)),
         converged=True,
-        status="constant Q: nothing to gain" if constant else "in closed form",
+        status=CONSTANT if constant else "in closed form",
     )
 
 
-def advantages(q_values: np.ndarray, constraint: WhitenedFeatures | np.ndarray, base_weights: np.ndarray) -> np.ndarray:
-    """Aᵢ = Qᵢ − V(sᵢ) with V the regression of Q on the constraint's features under W; shape (N,).
+def _exponential(
+    temperature: float,
+    logarithms: Float[np.ndarray, " n"],
+    q_values: Float[np.ndarray, " n"],
+    states: Int[np.ndarray, " n"],
+    visits: Float[np.ndarray, " s"],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " s"], float]:
+    """p(a|s) ∝ q(a|s) exp(Q(s, a)/η), V(s) and KL(p‖W), from log q(a|s), Q, the number of each state and W(s)."""
+    logits = logarithms + q_values / temperature  # eq. 12
+    highest = np.full(len(visits), -np.inf)
+    np.maximum.at(highest, states, logits)
+    normaliser = highest + np.log(np.bincount(states, weights=np.exp(logits - highest[states])))
+    logits = logits - normaliser[states]
+    chances = np.exp(logits)
+    return chances, temperature * normaliser, float((visits[states] * chances) @ (logits - logarithms))
+
+
+def _temperature(kl: Callable[[float], float], kl_bound: float) -> float:
+    """The η at which KL(p‖W) = ε, where the dual of eq. 13 has its minimum; the floor where no η reaches ε."""
+    low, high = TEMPERATURE_FLOOR, 1.0
+    if kl(low) <= kl_bound:
+        return low
+    while kl(high) > kl_bound:  # at most a few dozen times: KL falls as 1/η²
+        high *= 10
+
+    def excess(logarithm: float) -> float:
+        return kl(float(np.exp(logarithm))) - kl_bound
+
+    return float(np.exp(brentq(excess, np.log(low), np.log(high), xtol=1e-12)))
+
+
+def advantages(
+    q_values: Float[np.ndarray, " n"],
+    constraint: WhitenedFeatures | Int[np.ndarray, " n"],
+    base_weights: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """Aᵢ = Qᵢ − V(sᵢ) with V the regression of Q on the constraint's features under W.
 
     The limit of REPS at small bounds: p − W → √(2ε/E[A²])·W·A. Zero where only rounding is left of it.
 
     Args:
-      q_values: Qᵢ, shape (N,).
+      q_values: Qᵢ.
       constraint: the whitened features, or the number of each sample's state where it is to hold for each.
-      base_weights: Wᵢ, shape (N,).
+      base_weights: Wᵢ.
     """
     if isinstance(constraint, WhitenedFeatures):
         centred = q_values - base_weights @ q_values
@@ -229,29 +252,30 @@ def advantages(q_values: np.ndarray, constraint: WhitenedFeatures | np.ndarray, 
     return np.zeros_like(q_values) if rounding else advantage
 
 
-def _check(q_values: np.ndarray, state_features: np.ndarray, base_weights: np.ndarray, kl_bound: float) -> None:
+def _checked(
+    q_values: ArrayLike, states: ArrayLike, base_weights: ArrayLike, kl_bound: float
+) -> tuple[Float[np.ndarray, " n"], Shaped[np.ndarray, "n ..."], Float[np.ndarray, " n"]]:
+    q_values, states, base_weights = np.asarray(q_values), np.asarray(states), np.asarray(base_weights)
     size = len(q_values)
-    if q_values.shape != (size,) or base_weights.shape != (size,) or state_features.shape[:1] != (size,):
+    if q_values.shape != (size,) or base_weights.shape != (size,) or states.shape[:1] != (size,):
         raise ValueError(
             "reps_weights: expected q_values (N,), state_features (N, D) and base_weights (N,), got "
-            f"{q_values.shape}, {state_features.shape} and {base_weights.shape}"
+            f"{q_values.shape}, {states.shape} and {base_weights.shape}"
         )
-    if not (np.isfinite(kl_bound) and kl_bound > 0):
-        raise ValueError(f"kl_bound: expected a positive finite number, got {kl_bound}")
-    for name, array in (("q_values", q_values), ("state_features", state_features), ("base_weights", base_weights)):
-        _check_finite(name, array)
+    checks.positive("kl_bound", kl_bound)
+    for name, array in (("q_values", q_values), ("state_features", states), ("base_weights", base_weights)):
+        checks.finite(name, array)
     if np.any(base_weights <= 0) or abs(np.sum(base_weights) - 1) > 1e-6:
         raise ValueError(f"base_weights: expected positive entries with sum 1, got sum {np.sum(base_weights)}")
-
-
-def _check_finite(name: str, array: np.ndarray) -> None:
-    if not np.all(np.isfinite(array)):
-        raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
+    return q_values, states, base_weights
 
 
 def _solve_dual(
-    q_values: np.ndarray, features: np.ndarray, base_weights: np.ndarray, kl_bound: float
-) -> tuple[float, np.ndarray, bool, str]:
+    q_values: Float[np.ndarray, " n"],
+    features: Float[np.ndarray, "n r"],
+    base_weights: Float[np.ndarray, " n"],
+    kl_bound: float,
+) -> tuple[float, Float[np.ndarray, " r"], bool, str]:
     """Minimise g(η, v) = ηε + η log Σ Wᵢ exp((Qᵢ − vᵀφᵢ)/η) (eq. 13 with φ̂ = 0) over η ≥ floor and v."""
     rank = features.shape[1]
     unknown: Any = ca.MX.sym("eta_and_v", 1 + rank)
@@ -260,13 +284,13 @@ def _solve_dual(
     if rank:
         advantage = advantage - ca.mtimes(ca.DM(features), unknown[1:])
     logits = ca.DM(np.log(base_weights)) + advantage / eta
-    dual = eta * kl_bound + eta * ca.logsumexp(logits)
+    dual = eta * kl_bound + eta * ca.logsumexp(logits)  # eq. 13
     options: dict[str, Any] = {
         "print_time": False,
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
         "ipopt.hessian_approximation": "limited-memory",
-        "ipopt.limited_memory_max_history": 6,  # 20 need as many iterations, and each costs more
+        "ipopt.limited_memory_max_history": 6,  # a longer one saves no iterations
         "ipopt.tol": 1e-8,
         "ipopt.max_iter": ITERATIONS,
     }
