@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
+# One test process a core. Each holds up to 1.5 GiB; a process that is done takes tests from another.
+PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal
+
 .PHONY: run test check fast
 .DEFAULT_GOAL := run
 
@@ -15,10 +18,10 @@ run: $(VENV)/.installed
 	$(BIN)/bayespbrl run gridworld
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest -q
+	$(PYTEST)
 
 fast: $(VENV)/.installed
-	$(BIN)/python -m pytest -q -m "not slow"
+	$(PYTEST) -m "not slow"
 
 check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
