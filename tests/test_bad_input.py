@@ -94,6 +94,18 @@ def stopped(directory, message, *, env=None, expert=None, **parts):
     return learner
 
 
+def fails_again(learner, message, expert=None):
+    """Tried again, the learner fails again, and keeps nothing of it."""
+    before = contents(learner.log.path)
+    with pytest.raises(ValueError, match=message):
+        learner.run(expert or ReturnExpert())
+    assert contents(learner.log.path) == before
+
+
+def contents(directory):
+    return {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
 def goes_on(directory, completed, straight):
     """Mended, the run goes on from its last complete iteration and ends as if nothing had gone wrong."""
     learner = runs.resume(directory, env=Slope(), **own_parts())
@@ -102,37 +114,44 @@ def goes_on(directory, completed, straight):
     assert fingerprint(bayespbrl.load(directory, env=Slope(), **own_parts()).learner) == straight
 
 
-@pytest.mark.parametrize(
-    ("fault", "message"),
-    [
-        ("observation", "environment Slope: expected finite observations and rewards, got NaN or infinity at step 3"),
-        ("reward", "environment Slope: expected finite observations and rewards, got NaN or infinity at step 3"),
-        ("raises", "environment Slope failed at step 3: RuntimeError: the motor is on fire"),
-    ],
-)
+FINITE = "environment Slope: expected finite observations and rewards, got NaN or infinity at step 3"
+FAULTS = {
+    "observation": FINITE,
+    "reward": FINITE,
+    "raises": "environment Slope failed at step 3: RuntimeError: the motor is on fire",
+}
+
+
 @pytest.mark.parametrize(
     ("at", "completed"),
     [(3, 0), (10 * STEPS + 3, 0), (AN_ITERATION + 3, 1), (AN_ITERATION + 10 * STEPS + 3, 1)],
     ids=["first trajectory", "first evaluation", "second iteration", "second evaluation"],
 )
-def test_an_environment_that_fails_in_the_middle_of_a_trajectory(tmp_path, straight, fault, message, at, completed):
-    stopped(tmp_path / "run", message, env=Slope(fault, at))
+def test_an_environment_that_fails_in_the_middle_of_a_trajectory(tmp_path, straight, at, completed):
+    env = Slope("observation", at)
+    learner = stopped(tmp_path / "run", FAULTS["observation"], env=env)
+    for fault, message in FAULTS.items():
+        env.fault, env.at = fault, env.life + 3  # what failed is tried again from its beginning
+        fails_again(learner, message)
     goes_on(tmp_path / "run", completed, straight)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (lambda states: states[:, 0], r"features Faulty: expected shape \(\d+, D\), got \(\d+,\)"),
-        (lambda states: features(states)[1:], r"features Faulty: expected shape \(\d+, D\), got \(\d+, 4\)"),
-        (lambda states: np.zeros((len(states), 0)), r"features Faulty: expected shape \(\d+, D\), got \(\d+, 0\)"),
-        (lambda states: features(states).astype(str), "features Faulty: expected real numbers, got <U"),
-        (lambda states: features(states) * np.inf, "features Faulty: expected finite numbers, got NaN or infinity"),
-        (lambda states: None, r"features Faulty: expected shape \(\d+, D\), got \(\)"),
-    ],
-)
-def test_features_of_the_wrong_shape_or_kind(tmp_path, straight, calls_an_iteration, wrong, message):
-    stopped(tmp_path / "run", message, features=Faulty(features, wrong, calls_an_iteration + 1))
+WRONG = [
+    (lambda states: states[:, 0], r"features Faulty: expected shape \(\d+, D\), got \(\d+,\)"),
+    (lambda states: features(states)[1:], r"features Faulty: expected shape \(\d+, D\), got \(\d+, 4\)"),
+    (lambda states: np.zeros((len(states), 0)), r"features Faulty: expected shape \(\d+, D\), got \(\d+, 0\)"),
+    (lambda states: features(states).astype(str), "features Faulty: expected real numbers, got <U"),
+    (lambda states: features(states) * np.inf, "features Faulty: expected finite numbers, got NaN or infinity"),
+    (lambda states: None, r"features Faulty: expected shape \(\d+, D\), got \(\)"),
+]
+
+
+def test_features_of_the_wrong_shape_or_kind(tmp_path, straight, calls_an_iteration):
+    faulty = Faulty(features, WRONG[0][0], calls_an_iteration + 1)
+    learner = stopped(tmp_path / "run", WRONG[0][1], features=faulty)
+    for wrong, message in WRONG:
+        faulty.wrong = wrong
+        fails_again(learner, message)
     goes_on(tmp_path / "run", 1, straight)
 
 
@@ -142,10 +161,11 @@ def test_features_that_are_suddenly_more(tmp_path, straight, calls_an_iteration)
     goes_on(tmp_path / "run", 1, straight)
 
 
-@pytest.mark.parametrize("answer", ["perhaps", None, 1, ["first"], np.nan, True])
-def test_an_expert_that_returns_nonsense(tmp_path, straight, answer):
-    expert = Faulty(ReturnExpert(), lambda first, second: answer, 3)
-    stopped(tmp_path / "run", "expert: expected one of 'first', 'second', 'tie', .*, got ", expert=expert)
+def test_an_expert_that_returns_nonsense(tmp_path, straight):
+    message = "expert: expected one of 'first', 'second', 'tie', .*, got "
+    learner = stopped(tmp_path / "run", message, expert=Faulty(ReturnExpert(), lambda first, second: "perhaps", 3))
+    for answer in ("perhaps", None, 1, ["first"], np.nan, True):
+        fails_again(learner, message, expert=Faulty(ReturnExpert(), lambda first, second, a=answer: a, 0))
     goes_on(tmp_path / "run", 2, straight)
 
 

@@ -130,7 +130,7 @@ def test_what_is_loaded_is_what_was_learned(finished, straight):
     assert fingerprint(run.learner) == straight
     assert run.preferences.answers == 4
     assert len(run.trajectories) == 30
-    assert run.settings.kl_bound == 0.3
+    assert run.settings.update.kl_bound == 0.3
     assert run.posterior is None
     assert run.estimate.quality.status == "Optimal"
     assert run.estimate.utilities(np.arange(25)).shape == (25,)
@@ -181,8 +181,8 @@ def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):
 def test_settings_come_back_as_they_were_kept_whatever_the_preset_says_today(tmp_path):
     start(tmp_path / "run").ask()
     with mock.patch.dict(PRESETS["gridworld"], {"trajectory_discount": 1.0}):
-        assert bayespbrl.load(tmp_path / "run").settings.trajectory_discount is None
-        assert start(tmp_path / "new").settings.trajectory_discount == 1.0
+        assert bayespbrl.load(tmp_path / "run").settings.estimation.trajectory_discount is None
+        assert start(tmp_path / "new").settings.estimation.trajectory_discount == 1.0
 
 
 def test_an_environment_that_was_open_already_is_acted_in_as_it_is(tmp_path):
@@ -247,7 +247,7 @@ def test_an_environment_without_a_time_limit_leaves_nothing_behind(tmp_path):
     with pytest.raises(ValueError, match="CliffWalking-v1 states no time limit"):
         bayespbrl.start("CliffWalking-v1", tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
-    assert bayespbrl.start("CliffWalking-v1", tmp_path / "run", max_steps=5).settings.max_steps == 5
+    assert bayespbrl.start("CliffWalking-v1", tmp_path / "run", max_steps=5).settings.rollouts.max_steps == 5
 
 
 def test_without_a_directory_a_fresh_one_is_made_under_runs(tmp_path, monkeypatch):
@@ -651,7 +651,7 @@ def test_an_environment_that_its_name_would_not_give_again_has_to_be_passed(tmp_
         with pytest.raises(ValueError, match="environment of the user's own: expected it again as env="):
             read(tmp_path / "run")
     assert bayespbrl.load(tmp_path / "run", env=made()).settings.environment == "other"
-    assert "Pendulum-v1 was an object of the user's" in write_report(tmp_path / "run", format="md").read_text(
+    assert "Pendulum-v1 is an object of your own" in write_report(tmp_path / "run", format="md").read_text(
         encoding="utf-8"
     )
 
@@ -670,7 +670,7 @@ def test_arguments_that_are_arrays_are_compared():
 def test_an_environment_as_its_name_makes_it_need_not_be_passed_again(tmp_path):
     environment = gymnasium.make("bayespbrl/Gridworld-v0", render_mode="rgb_array")
     learner = bayespbrl.start(environment, tmp_path / "run", **QUICK)
-    assert learner.settings.discount == 0.995  # the preset's
+    assert learner.settings.critic.discount == 0.995  # the preset's
     learner.run(ReturnExpert())
     assert fingerprint(bayespbrl.load(tmp_path / "run").learner) == fingerprint(learner)
 
