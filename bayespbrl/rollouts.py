@@ -94,12 +94,7 @@ def rollout(
 
 
 def returns(
-    environment: AnyEnvironment,
-    policy: Sampler,
-    *,
-    key: Key[Array, ""],
-    episodes: int,
-    max_steps: int | None = None,
+    environment: AnyEnvironment, policy: Sampler, *, key: Key[Array, ""], episodes: int, max_steps: int | None = None
 ) -> Returns:
     """Undiscounted returns of the same episodes as `rollout` with the same arguments, without keeping them.
 
@@ -290,13 +285,7 @@ def _act_one_by_one(
 
 
 def _by_interface(
-    env: gymnasium.Env,
-    policy: Sampler,
-    key: Key[Array, ""],
-    episodes: int,
-    steps: int,
-    explicit: bool,
-    hold: int = 1,
+    env: gymnasium.Env, policy: Sampler, key: Key[Array, ""], episodes: int, steps: int, explicit: bool, hold: int = 1
 ) -> Iterator[Trajectory]:
     seed_key, policy_key = jax.random.split(key)
     seed = int(jax.random.randint(seed_key, (), 0, 2**30))

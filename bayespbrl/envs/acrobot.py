@@ -10,9 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Key
 
 from bayespbrl.envs.angles import wrapped
-from bayespbrl.envs.film_strip import draw_film_strip, draw_pose
+from bayespbrl.envs.film_strip import Line, draw_film_strip, draw_pose
 from bayespbrl.envs.functional import FunctionalEnv
 
 MASS_1 = MASS_2 = 1.0  # kg
@@ -26,6 +29,8 @@ MAX_SPEED_1, MAX_SPEED_2 = 4 * np.pi, 9 * np.pi  # rad/s
 SUBSTEP_SECONDS, SUBSTEPS = 0.05, 4
 OBSERVATION_LIMIT = np.array([np.pi, np.pi, MAX_SPEED_1, MAX_SPEED_2])
 GOAL_HEIGHT = 1.0  # m above the first joint
+State = Float[Array, "4"]
+Action = Float[Array, "1"]
 
 
 class AcrobotDynamics(FuncEnv):
@@ -42,22 +47,22 @@ class AcrobotDynamics(FuncEnv):
     observation_period: tuple[float, ...] = (2 * np.pi, 2 * np.pi, np.inf, np.inf)
     frames_per_second = 1 / (SUBSTEPS * SUBSTEP_SECONDS)
 
-    def initial(self, rng: jax.Array, params: Any = None) -> jax.Array:
+    def initial(self, rng: Key[Array, ""], params: Any = None) -> State:
         """At rest, hanging down."""
         return jnp.zeros(4)
 
-    def transition(self, state: Any, action: Any, rng: jax.Array, params: Any = None) -> jax.Array:
+    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: Any = None) -> State:
         """One step: the torque clipped, then noise on it."""
         noise = jax.random.uniform(rng, minval=-TORQUE_NOISE, maxval=TORQUE_NOISE)
         return self.swing(state, jnp.clip(action[0], -MAX_TORQUE, MAX_TORQUE) + noise)
 
-    def swing(self, state: Any, torque: Any) -> jax.Array:
+    def swing(self, state: State, torque: ArrayLike) -> State:
         """Four semi-implicit Euler sub-steps under the constant `torque` that really acts.
 
         Decision: the velocities are limited after every sub-step.
         """
 
-        def substep(_: Any, state: Any) -> Any:
+        def substep(_: int, state: State) -> State:
             angles, speeds = state[:2], state[2:]
             limits = jnp.asarray(OBSERVATION_LIMIT[2:])
             speeds = jnp.clip(speeds + SUBSTEP_SECONDS * self.accelerations(state, torque), -limits, limits)
@@ -65,11 +70,12 @@ class AcrobotDynamics(FuncEnv):
 
         return jax.lax.fori_loop(0, SUBSTEPS, substep, jnp.asarray(state))
 
-    def accelerations(self, state: Any, torque: Any) -> jax.Array:
-        """(θ̈₁, θ̈₂), with the book's signs."""
+    def accelerations(self, state: State, torque: ArrayLike) -> Float[Array, "2"]:
+        """(θ̈₁, θ̈₂) by Sutton and Barto (1998), figure 11.5."""
         angle_1, angle_2, speed_1, speed_2 = state
-        coupling = MASS_2 * LENGTH_1 * CENTRE
+        coupling = MASS_2 * LENGTH_1 * CENTRE  # m₂ l₁ l_c2
         sine, cosine = jnp.sin(angle_2), jnp.cos(angle_2)
+        # figure 11.5: d₁, d₂, φ₂, φ₁
         d1 = MASS_1 * CENTRE**2 + MASS_2 * (LENGTH_1**2 + CENTRE**2) + 2 * coupling * cosine + INERTIA_1 + INERTIA_2
         d2 = MASS_2 * CENTRE**2 + coupling * cosine + INERTIA_2
         phi2 = MASS_2 * CENTRE * GRAVITY * jnp.cos(angle_1 + angle_2 - jnp.pi / 2)
@@ -79,24 +85,27 @@ class AcrobotDynamics(FuncEnv):
             + (MASS_1 * CENTRE + MASS_2 * LENGTH_1) * GRAVITY * jnp.cos(angle_1 - jnp.pi / 2)
             + phi2
         )
+        # figure 11.5: θ̈₂, then θ̈₁ from it
         second = (torque + d2 / d1 * phi1 - coupling * speed_1**2 * sine - phi2) / (
             MASS_2 * CENTRE**2 + INERTIA_2 - d2**2 / d1
         )
         return jnp.stack([-(d2 * second + phi1) / d1, second])
 
-    def observation(self, state: Any, rng: Any = None, params: Any = None) -> Any:
+    def observation(self, state: State, rng: Any = None, params: Any = None) -> State:
         """The state itself."""
         return state
 
-    def reward(self, state: Any, action: Any, next_state: Any, rng: Any = None, params: Any = None) -> Any:
+    def reward(
+        self, state: State, action: Action, next_state: State, rng: Any = None, params: Any = None
+    ) -> Float[Array, ""]:
         """−1 a step. Decision: the step that reaches the goal included, so that −return is the number of steps."""
         return jnp.asarray(-1.0)
 
-    def terminal(self, state: Any, rng: Any = None, params: Any = None) -> Any:
+    def terminal(self, state: State, rng: Any = None, params: Any = None) -> Bool[Array, ""]:
         """The tip more than 1 m above the first joint."""
         return -LENGTH_1 * jnp.cos(state[0]) - LENGTH_2 * jnp.cos(state[0] + state[1]) > GOAL_HEIGHT
 
-    def pose(self, observation: Any) -> list[np.ndarray]:
+    def pose(self, observation: Float[np.ndarray, " s"]) -> list[Line]:
         """The two links as lines in the square [−1, 1]², at half their size."""
         first, both = float(observation[0]), float(observation[0] + observation[1])
         elbow = 0.5 * np.array([np.sin(first), -np.cos(first)])
@@ -112,7 +121,7 @@ class AcrobotDynamics(FuncEnv):
         axes.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal", xticks=[], yticks=[])
 
     def draw_trajectory(self, trajectory: Any, axes: Any) -> None:
-        """A film strip of both links; the title tells after how many steps the goal was reached."""
+        """A film strip of both links; the title says after how many steps the goal was reached."""
         draw_film_strip(self.pose, trajectory.states, axes, step_seconds=SUBSTEPS * SUBSTEP_SECONDS)
         outcome = "reached the goal" if trajectory.terminated else "did not reach the goal"
         axes.set_title(f"{outcome} in {len(trajectory)} steps")
@@ -122,7 +131,7 @@ DYNAMICS = AcrobotDynamics()
 
 
 class Acrobot(FunctionalEnv):
-    """Two links on a bar, driven at the elbow only, to swing their tip over a line.
+    """Two links that hang from a bar, driven at the elbow only; their tip has to swing above a line.
 
     ## Action space
     `Box(-1, 1, (1,), float64)`. Noise U(−0.2, 0.2) N m is added to the torque and not clipped.

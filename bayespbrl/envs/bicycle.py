@@ -10,6 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Key
 
 from bayespbrl.envs.functional import FunctionalEnv
 
@@ -43,6 +46,8 @@ START_SPREAD = np.array([0.1413, 0.3320, 0.0738, 0.3495])
 # Not enforced. Before the fall ∫ω̇ dt stays within 24°, so |θ̇| < 11 + 20.4 t rad/s (48 s to pass the limit), and
 # 16 rad/s² over 24° cannot bring ω̇ past 4 rad/s.
 OBSERVATION_LIMIT = np.array([MAX_STEERING, 1000.0, np.pi / 2, 10.0])
+State = Float[Array, "4"]
+Action = Float[Array, "2"]
 
 
 class BicycleDynamics(FuncEnv):
@@ -59,18 +64,18 @@ class BicycleDynamics(FuncEnv):
     observation_period: tuple[float, ...] = (np.inf,) * 4
     frames_per_second = 20.0  # a fifth of real time
 
-    def initial(self, rng: jax.Array, params: Any = None) -> jax.Array:
+    def initial(self, rng: Key[Array, ""], params: Any = None) -> State:
         """Uniform about riding straight and upright."""
         return jax.random.uniform(rng, (4,), minval=-1.0, maxval=1.0) * jnp.asarray(START_SPREAD)
 
-    def transition(self, state: Any, action: Any, rng: jax.Array, params: Any = None) -> jax.Array:
+    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: Any = None) -> State:
         """One step: both actions clipped, then noise on the displacement only."""
         torque = jnp.clip(action[0], -MAX_TORQUE, MAX_TORQUE)
         displacement = jnp.clip(action[1], -MAX_DISPLACEMENT, MAX_DISPLACEMENT)
         noise = jax.random.uniform(rng, minval=-DISPLACEMENT_NOISE, maxval=DISPLACEMENT_NOISE)
         return self.ride(state, torque, displacement + noise)
 
-    def ride(self, state: Any, torque: Any, displacement: Any) -> jax.Array:
+    def ride(self, state: State, torque: ArrayLike, displacement: ArrayLike) -> State:
         """One semi-implicit Euler step under the torque and displacement that really act."""
         steering, steering_speed, lean, lean_speed = state
         steering_acceleration, lean_acceleration = self.accelerations(state, torque, displacement)
@@ -80,30 +85,33 @@ class BicycleDynamics(FuncEnv):
         steering = jnp.clip(steering + steering_speed * STEP_SECONDS, -MAX_STEERING, MAX_STEERING)
         return jnp.stack([steering, steering_speed, lean, lean_speed])
 
-    def accelerations(self, state: Any, torque: Any, displacement: Any) -> tuple[Any, Any]:
-        """(θ̈, ω̈)."""
+    def accelerations(self, state: State, torque: ArrayLike, displacement: ArrayLike) -> tuple[Array, Array]:
+        """(θ̈, ω̈) by Randløv and Alstrøm (1998)."""
         steering, steering_speed, lean, lean_speed = state
-        # Curvatures instead of radii: they are zero, not infinite, when riding straight on.
+        # 1/r_f, 1/r_b and 1/r_CM instead of the radii, which are infinite when riding straight on
         tangent = jnp.abs(jnp.tan(steering))
         front, back = jnp.abs(jnp.sin(steering)) / WHEELBASE, tangent / WHEELBASE
         centre = tangent / jnp.sqrt(((WHEELBASE - CENTRE_BEHIND) * tangent) ** 2 + WHEELBASE**2)
-        total_lean = lean + jnp.arctan(displacement / HEIGHT)
+        total_lean = lean + jnp.arctan(displacement / HEIGHT)  # φ
         tyres = TYRE_MASS * TYRE_RADIUS * (front + back)
         centrifugal = jnp.sign(steering) * VELOCITY**2 * (tyres + TOTAL_MASS * HEIGHT * centre)
         tilting = HEIGHT * TOTAL_MASS * GRAVITY * jnp.sin(total_lean)
         righting = jnp.cos(total_lean) * (INERTIA_SPIN * SPIN * steering_speed + centrifugal)
-        return (torque - INERTIA_TYRE * SPIN * lean_speed) / INERTIA_STEERING, (tilting - righting) / INERTIA_BICYCLE
+        steering_acceleration = (torque - INERTIA_TYRE * SPIN * lean_speed) / INERTIA_STEERING  # θ̈
+        return steering_acceleration, (tilting - righting) / INERTIA_BICYCLE  # ω̈
 
-    def observation(self, state: Any, rng: Any = None, params: Any = None) -> Any:
+    def observation(self, state: State, rng: Any = None, params: Any = None) -> State:
         """The state itself."""
         return state
 
-    def reward(self, state: Any, action: Any, next_state: Any, rng: Any = None, params: Any = None) -> Any:
+    def reward(
+        self, state: State, action: Action, next_state: State, rng: Any = None, params: Any = None
+    ) -> Float[Array, ""]:
         """−(ω′·15/π)² − 100·[fallen]. Decision: of several in the sources, the one that tells good riders apart."""
         return -((next_state[2] / FALL_ANGLE) ** 2) - 100.0 * self.terminal(next_state)
 
-    def terminal(self, state: Any, rng: Any = None, params: Any = None) -> Any:
-        """Leaning further than 12°."""
+    def terminal(self, state: State, rng: Any = None, params: Any = None) -> Bool[Array, ""]:
+        """The bicycle leans further than 12°."""
         return jnp.abs(state[2]) > FALL_ANGLE
 
     def draw(self, observation: Any, axes: Any) -> None:
@@ -138,7 +146,7 @@ DYNAMICS = BicycleDynamics()
 
 
 class Bicycle(FunctionalEnv):
-    """A bicycle at 10 km/h to be kept from falling over.
+    """A bicycle at 10 km/h that must not fall over.
 
     ## Action space
     `Box((2,), float64)`. Noise U(−0.02, 0.02) m is added to the displacement.

@@ -4,13 +4,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
+Line = Float[np.ndarray, "points 2"]
 COLUMNS = 6
 MAX_POSES = 30
 
 
-def draw_pose(lines: Sequence[np.ndarray], axes: Any, *, offset: Any = (0.0, 0.0), width: float = 6.0) -> None:
-    """Connected limbs: each of `lines` is an (n, 2) polyline, drawn with a joint at its first point."""
+def draw_pose(lines: Sequence[Line], axes: Any, *, offset: ArrayLike = (0.0, 0.0), width: float = 6.0) -> None:
+    """Connected limbs: each polyline is drawn with a joint at its first point."""
     for number, line in enumerate(lines):
         x, y = (np.asarray(line) + offset).T
         axes.plot(x, y, color=f"C{number}", linewidth=width, solid_capstyle="round")
@@ -18,13 +21,17 @@ def draw_pose(lines: Sequence[np.ndarray], axes: Any, *, offset: Any = (0.0, 0.0
 
 
 def draw_film_strip(
-    pose: Callable[[Any], Sequence[np.ndarray]], states: np.ndarray, axes: Any, *, step_seconds: float
+    pose: Callable[[Float[np.ndarray, " s"]], Sequence[Line]],
+    states: Float[np.ndarray, "t s"],
+    axes: Any,
+    *,
+    step_seconds: float,
 ) -> None:
     """At most 30 poses, first and last among them, six a row, each with its time.
 
     Args:
       pose: the polylines of one observation, in the square [−1, 1]².
-      states: observations, shape (T+1, S).
+      states: observations.
       axes: matplotlib axes.
       step_seconds: duration of a step.
     """

@@ -1,9 +1,10 @@
-"""Pure environment functions as a gymnasium environment (step 3 of the cycle needs both views of one dynamics).
+"""Pure environment functions as a gymnasium environment; step 3 needs both views of the same dynamics.
 
 `reset` and `step` fix how one key is shared among the functions of a `FuncEnv`; the gymnasium class below and the
 compiled rollouts both go through them, so that the two views cannot drift apart.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -11,19 +12,21 @@ import gymnasium
 import jax
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
+from jax import Array
+from jaxtyping import Key, UInt8
 
 
-def reset(dynamics: FuncEnv, key: jax.Array) -> tuple[Any, Any]:
+def reset(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Any, Any]:
     """Start an episode: `(state, observation)`. Traceable; follows its caller's dtype."""
     initial_key, observation_key = jax.random.split(key)
     state = dynamics.initial(initial_key)
     return state, dynamics.observation(state, observation_key)
 
 
-def step(dynamics: FuncEnv, key: jax.Array, state: Any, action: Any) -> tuple[Any, Any, Any, Any]:
+def step(dynamics: FuncEnv, key: Key[Array, ""], state: Any, action: Any) -> tuple[Any, Any, Any, Any]:
     """One step: `(next_state, observation, reward, terminated)`. Traceable; follows its caller's dtype.
 
-    The action is passed on as it comes: clipping to the action space is the caller's or the dynamics' affair.
+    The action is passed on as it comes; the caller or the dynamics clip it to the action space.
     """
     transition_key, observation_key, reward_key, terminal_key = jax.random.split(key, 4)
     next_state = dynamics.transition(state, action, transition_key)
@@ -74,7 +77,7 @@ class FunctionalEnv(gymnasium.Env):
         return self._observation(observation), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One step; `truncated` is always False here, the time limit being gymnasium's `TimeLimit` wrapper's."""
+        """One step; `truncated` is always False, because the time limit is gymnasium's `TimeLimit` wrapper."""
         if self._key is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         self._key, step_key = jax.random.split(self._key)
@@ -100,8 +103,10 @@ class FunctionalEnv(gymnasium.Env):
         return picture(partial(self.dynamics.draw, self._observed))  # type: ignore[attr-defined]
 
 
-def picture(draw: Any, *, inches: tuple[float, float] = (4.0, 4.0), dots_per_inch: int = 80) -> np.ndarray:
-    """What `draw(axes)` draws, as an array of shape (height, width, 3) uint8, without matplotlib's global state."""
+def picture(
+    draw: Callable[[Any], Any], *, inches: tuple[float, float] = (4.0, 4.0), dots_per_inch: int = 80
+) -> UInt8[np.ndarray, "height width 3"]:
+    """What `draw(axes)` draws, without matplotlib's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

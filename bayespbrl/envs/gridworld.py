@@ -1,4 +1,4 @@
-"""The Gridworld of Akrour et al. (2014), the paper's first domain: reward doubles towards one corner."""
+"""The Gridworld of Akrour et al. (2014), the paper's first domain: the reward doubles towards one corner."""
 
 from typing import Any
 
@@ -7,17 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Discrete
+from jax import Array
+from jaxtyping import Bool, Float, Int, Key
 
 from bayespbrl.envs.functional import FunctionalEnv
 
 SIZE = 5
 STAY_PROBABILITY = 0.5
-# (row, column) moves; rows count downwards from the top.
+# stay, left, down, right, up as (row, column); rows count downwards from the top
 MOVES = np.array([(0, 0), (0, -1), (1, 0), (0, 1), (-1, 0)])
-ACTION_NAMES = ("stay", "left", "down", "right", "up")
 START = SIZE * (SIZE // 2) + SIZE // 2  # the centre
 # r = 2^−(4−(j−1)+(i−1)) for row i and column j counted from 1: top right 1, bottom left 1/256.
 REWARDS = 2.0 ** -(SIZE - 1 - np.arange(SIZE)[None, :] + np.arange(SIZE)[:, None]).astype(float)
+Cell = Int[Array, ""]
 
 
 class GridworldDynamics(FuncEnv):
@@ -30,45 +32,48 @@ class GridworldDynamics(FuncEnv):
     grid_shape = (SIZE, SIZE)
     optimal_return = 294.8125  # expected over 300 steps, by dynamic programming on `transition_table`
 
-    def initial(self, rng: jax.Array, params: Any = None) -> jax.Array:
+    def initial(self, rng: Key[Array, ""], params: Any = None) -> Cell:
         """The centre cell."""
         return jnp.asarray(START)
 
-    def transition(self, state: Any, action: Any, rng: jax.Array, params: Any = None) -> jax.Array:
+    def transition(self, state: Cell, action: Cell, rng: Key[Array, ""], params: Any = None) -> Cell:
         """With probability ½ the move, else stay; moves off the grid are clamped."""
         succeeds = jax.random.bernoulli(rng, 1 - STAY_PROBABILITY)
         moved = self.move(state, action)
         return jnp.where(succeeds, moved, state)
 
-    def move(self, state: Any, action: Any) -> jax.Array:
+    def move(self, state: Cell, action: Cell) -> Cell:
         """The cell that a successful `action` leads to."""
         row, column = jnp.divmod(jnp.asarray(state), SIZE)
         change = jnp.asarray(MOVES, row.dtype)[action]
         row, column = jnp.clip(row + change[0], 0, SIZE - 1), jnp.clip(column + change[1], 0, SIZE - 1)
         return SIZE * row + column
 
-    def observation(self, state: Any, rng: Any = None, params: Any = None) -> Any:
+    def observation(self, state: Cell, rng: Any = None, params: Any = None) -> Cell:
         """The state itself."""
         return state
 
-    def reward(self, state: Any, action: Any, next_state: Any, rng: Any = None, params: Any = None) -> jax.Array:
+    def reward(
+        self, state: Cell, action: Cell, next_state: Cell, rng: Any = None, params: Any = None
+    ) -> Float[Array, ""]:
         """The reward of the *next* cell."""
         return jnp.asarray(REWARDS.reshape(-1))[next_state]
 
-    def terminal(self, state: Any, rng: Any = None, params: Any = None) -> Any:
+    def terminal(self, state: Cell, rng: Any = None, params: Any = None) -> Bool[Array, ""]:
         """Never."""
         return jnp.zeros_like(state, dtype=bool)
 
-    def transition_table(self) -> np.ndarray:
-        """P(s′ | s, a), shape (25, 5, 25), from `move`: for planning and for tests."""
+    def transition_table(self) -> Float[np.ndarray, "25 5 25"]:
+        """P(s′ | s, a) from `move`, for planning and for tests."""
         states, actions = np.divmod(np.arange(SIZE * SIZE * len(MOVES)), len(MOVES))
         table = np.zeros((SIZE * SIZE, len(MOVES), SIZE * SIZE))
+        moved = np.asarray(jax.vmap(self.move)(jnp.asarray(states), jnp.asarray(actions)))
         table[states, actions, states] += STAY_PROBABILITY
-        table[states, actions, np.asarray(jax.vmap(self.move)(states, actions))] += 1 - STAY_PROBABILITY
+        table[states, actions, moved] += 1 - STAY_PROBABILITY
         return table
 
     def draw(self, observation: Any, axes: Any) -> None:
-        """One position on the grid; the hidden reward is not shown, because a person who judges must not see it."""
+        """One position on the grid; the hidden reward is not shown, because who judges must not see it."""
         _draw_grid(axes)
         row, column = divmod(int(observation), SIZE)
         axes.scatter([column], [row], s=900, color="tab:blue", zorder=3)

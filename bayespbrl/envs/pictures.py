@@ -1,4 +1,4 @@
-"""Pictures of trajectories for a person to judge by: one drawing of the whole, or a film.
+"""Pictures of trajectories for a person to judge: one drawing of the whole, or a film.
 
 An environment's dynamics may offer `draw(observation, axes)` and `draw_trajectory(trajectory, axes)`; without them the
 observations are drawn against time. No hidden reward is shown.
@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int, UInt8
 from PIL import Image
 
+from bayespbrl.checks import whole
 from bayespbrl.envs.functional import picture
-from bayespbrl.envs.opening import environment_attribute, open_environment
+from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, open_environment
 
 MAX_FRAMES = 100
 
@@ -43,21 +45,24 @@ def draw_trajectory(environment: Any, trajectory: Any, axes: Any) -> Any:
     return axes
 
 
-def frames(environment: Any, trajectory: Any, *, max_frames: int = MAX_FRAMES) -> np.ndarray:
-    """RGB pictures of the states, evenly spread, first and last among them; shape (F, height, width, 3) uint8.
+def frames(
+    environment: AnyEnvironment, trajectory: Any, *, max_frames: int = MAX_FRAMES
+) -> UInt8[np.ndarray, "f height width 3"]:
+    """RGB pictures of the states, evenly spread, first and last among them.
 
     A single picture of the whole trajectory where the environment cannot draw one observation.
     """
-    if max_frames < 2:
-        raise ValueError(f"max_frames: expected at least 2, got {max_frames}")
+    whole("max_frames", max_frames, least=2)
     draw = environment_attribute(open_environment(environment), "draw")
     if draw is None:
-        return picture(lambda axes: draw_trajectory(environment, trajectory, axes))[None]
+        return picture(partial(draw_trajectory, environment, trajectory))[None]
     shown = _spread(len(trajectory.states), max_frames)
-    return np.stack([picture(lambda axes, index=index: draw(trajectory.states[index], axes)) for index in shown])
+    return np.stack([picture(partial(draw, trajectory.states[index])) for index in shown])
 
 
-def film(environment: Any, trajectory: Any, path: str | os.PathLike[str], *, max_frames: int = MAX_FRAMES) -> Path:
+def film(
+    environment: AnyEnvironment, trajectory: Any, path: str | os.PathLike[str], *, max_frames: int = MAX_FRAMES
+) -> Path:
     """Write `frames` as an animated GIF, at the speed the dynamics state (`frames_per_second`, 10 by default)."""
     pictures = frames(environment, trajectory, max_frames=max_frames)
     stride = len(trajectory.states) / len(pictures)
@@ -65,16 +70,18 @@ def film(environment: Any, trajectory: Any, path: str | os.PathLike[str], *, max
     return animation(pictures, path, milliseconds=1000 * stride / rate)
 
 
-def drawing(environment: Any, trajectory: Any, path: str | os.PathLike[str]) -> Path:
+def drawing(environment: AnyEnvironment, trajectory: Any, path: str | os.PathLike[str]) -> Path:
     """Write `draw_trajectory` as a PNG."""
     Image.fromarray(picture(partial(draw_trajectory, environment, trajectory), inches=(9.0, 7.0))).save(path, "PNG")
     return Path(path)
 
 
-def animation(frames: np.ndarray, path: str | os.PathLike[str], *, milliseconds: float) -> Path:
-    """Write pictures, shape (F, height, width, 3) uint8, as a GIF that rests on the last.
+def animation(
+    frames: UInt8[np.ndarray, "f height width 3"], path: str | os.PathLike[str], *, milliseconds: float
+) -> Path:
+    """Write pictures as a GIF that rests on the last.
 
-    `milliseconds` is how long each is shown, at least 20 (what viewers manage).
+    `milliseconds` is how long each is shown, at least 20, which is as fast as viewers are.
     """
     images = [Image.fromarray(frame) for frame in frames]
     durations = [max(20, round(milliseconds))] * (len(images) - 1) + [1500]
@@ -82,7 +89,9 @@ def animation(frames: np.ndarray, path: str | os.PathLike[str], *, milliseconds:
     return Path(path)
 
 
-def contact_sheet(frames: np.ndarray, path: str | os.PathLike[str], *, most: int = 12, columns: int = 6) -> Path:
+def contact_sheet(
+    frames: UInt8[np.ndarray, "f height width 3"], path: str | os.PathLike[str], *, most: int = 12, columns: int = 6
+) -> Path:
     """Write at most `most` of the pictures, evenly spread, as one PNG, row by row."""
     shown = frames[_spread(len(frames), most)]
     rows = -(-len(shown) // columns)
@@ -95,6 +104,6 @@ def contact_sheet(frames: np.ndarray, path: str | os.PathLike[str], *, most: int
     return Path(path)
 
 
-def _spread(number: int, most: int) -> np.ndarray:
+def _spread(number: int, most: int) -> Int[np.ndarray, " f"]:
     """At most `most` of the indices below `number`, evenly spread, first and last among them."""
     return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(int))

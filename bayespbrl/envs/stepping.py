@@ -8,16 +8,19 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from jaxtyping import Float, Shaped
+from numpy.typing import ArrayLike
 
 from bayespbrl.envs.opening import environment_name, flattened, made_from
 
 MAX_LANES = 128  # copies of an environment stepped side by side
-Episode = tuple[np.ndarray, np.ndarray, np.ndarray, bool]
+Rows = Shaped[np.ndarray, "n ..."]
+Episode = tuple[Rows, Rows, Float[np.ndarray, " t"], bool]
 
 
 def episodes_by_interface(
     env: gymnasium.Env,
-    act: Callable[[int, np.ndarray], np.ndarray],
+    act: Callable[[int, Rows], Rows],
     *,
     seed: int,
     episodes: int,
@@ -42,14 +45,14 @@ def episodes_by_interface(
     name = environment_name(env)
     try:
         for first in range(0, episodes, lanes):
-            batch = _batch(vector, name, lambda t, seen, first=first: act(first * steps + t, seen), seed + first, steps)
-            yield from batch[: episodes - first]
+            vector_episodes = _batch(vector, name, act, seed=seed, first=first, steps=steps)
+            yield from vector_episodes[: episodes - first]
     finally:
         vector.close()
 
 
 class _Borrowed(gymnasium.Wrapper):
-    """The user's own environment: ours to step, not ours to close."""
+    """The user's own environment, which is not closed with its copies."""
 
     def close(self) -> None:
         """Nothing."""
@@ -70,20 +73,25 @@ def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None) -> VectorEnv
     return gymnasium.make_vec(spec, num_envs=lanes, vectorization_mode="sync", wrappers=wrappers, **options)
 
 
-def _batch(vector: VectorEnv, name: str, act: Any, seed: int, steps: int) -> list[Episode]:
-    """One episode a lane. A lane that has ended is stepped on with the others (it resets itself), and ignored."""
+def _batch(
+    vector: VectorEnv, name: str, act: Callable[[int, Rows], Rows], *, seed: int, first: int, steps: int
+) -> list[Episode]:
+    """One episode a lane, from episode `first` on.
+
+    A lane that has ended goes on with the others (it resets itself) and is ignored.
+    """
     lanes, seen, done = vector.num_envs, vector.single_observation_space, vector.single_action_space
     with _blaming(name, "its reset"):
-        observations, _ = vector.reset(seed=seed)
+        observations, _ = vector.reset(seed=seed + first)
     alive, ended, lengths = np.ones(lanes, bool), np.zeros(lanes, bool), np.zeros(lanes, int)
-    states, actions, rewards = [_checked(name, "its reset", _wide(seen, observations))], [], []
+    states, actions, rewards = [_finite(name, "its reset", _wide(seen, observations))], [], []
     t = 0
     while t < steps and alive.any():
-        actions.append(_within(done, act(t, states[-1])))
+        actions.append(_within(done, act(first * steps + t, states[-1])))
         t += 1
         with _blaming(name, f"step {t}"):
             observations, reward, terminated, truncated, _ = vector.step(actions[-1])
-        _checked(name, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
+        _finite(name, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
         # what idle lanes return must not reach the policy as NaN
         states.append(np.nan_to_num(_wide(seen, observations)))
         rewards.append(np.asarray(reward, float))
@@ -97,17 +105,17 @@ def _batch(vector: VectorEnv, name: str, act: Any, seed: int, steps: int) -> lis
     ]
 
 
-def _wide(space: Any, values: Any) -> np.ndarray:
+def _wide(space: gymnasium.Space[Any], values: ArrayLike) -> Rows:
     return np.asarray(values).astype(float if isinstance(space, Box) else np.int64)
 
 
-def _within(space: Any, actions: np.ndarray) -> np.ndarray:
+def _within(space: gymnasium.Space[Any], actions: Rows) -> Rows:
     if isinstance(space, Box):
         return np.clip(actions.reshape(len(actions), -1), space.low, space.high).astype(space.dtype)
     return np.asarray(actions).astype(np.int64)
 
 
-def _checked(name: str, where: str, *values: np.ndarray) -> np.ndarray:
+def _finite(name: str, where: str, *values: Rows) -> Rows:
     if not all(np.isfinite(value).all() for value in values):
         raise ValueError(
             f"environment {name}: expected finite observations and rewards, got NaN or infinity at {where}"

@@ -10,9 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Key
 
 from bayespbrl.envs.angles import wrapped
-from bayespbrl.envs.film_strip import draw_film_strip, draw_pose
+from bayespbrl.envs.film_strip import Line, draw_film_strip, draw_pose
 from bayespbrl.envs.functional import FunctionalEnv
 
 MASS = 10.0  # kg
@@ -28,6 +31,8 @@ SUBSTEPS = 50  # of 1 ms
 START_SPREAD = 0.2  # rad about hanging down
 # Friction balances the greatest torque and weight at this speed, and no Euler step can pass it.
 MAX_SPEED = (WEIGHT + MAX_TORQUE / INERTIA) / FRICTION  # 474.3 rad/s
+State = Float[Array, "2"]
+Action = Float[Array, "1"]
 
 
 class SwingUpDynamics(FuncEnv):
@@ -40,21 +45,21 @@ class SwingUpDynamics(FuncEnv):
     frames_per_second = 1 / CONTROL_STEP
     published_returns: tuple[tuple[str, float], ...] = (("every method of the paper, about", -1900.0),)
 
-    def initial(self, rng: jax.Array, params: Any = None) -> jax.Array:
-        """At rest, hanging down give or take 0.2 rad."""
+    def initial(self, rng: Key[Array, ""], params: Any = None) -> State:
+        """At rest, within 0.2 rad of hanging down."""
         angle = jax.random.uniform(rng, minval=np.pi - START_SPREAD, maxval=np.pi + START_SPREAD)
         return jnp.stack([wrapped(angle), jnp.zeros_like(angle)])
 
-    def transition(self, state: Any, action: Any, rng: jax.Array, params: Any = None) -> jax.Array:
+    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: Any = None) -> State:
         """One control step: noise on the torque, then the clip."""
         noise = TORQUE_NOISE * jax.random.normal(rng)
         return self.swing(state, jnp.clip(action[0] + noise, -MAX_TORQUE, MAX_TORQUE))
 
-    def swing(self, state: Any, torque: Any) -> jax.Array:
+    def swing(self, state: State, torque: ArrayLike) -> State:
         """One control step under the constant `torque` that really acts, by symplectic Euler."""
         seconds = CONTROL_STEP / SUBSTEPS
 
-        def substep(_: Any, moving: Any) -> Any:
+        def substep(_: int, moving: tuple[Array, Array]) -> tuple[Array, Array]:
             angle, speed = moving
             speed = speed + seconds * self.acceleration(angle, speed, torque)
             return angle + seconds * speed, speed
@@ -62,23 +67,25 @@ class SwingUpDynamics(FuncEnv):
         angle, speed = jax.lax.fori_loop(0, SUBSTEPS, substep, (state[0], state[1]))
         return jnp.stack([wrapped(angle), speed])
 
-    def acceleration(self, angle: Any, speed: Any, torque: Any) -> Any:
+    def acceleration(self, angle: Array, speed: Array, torque: ArrayLike) -> Array:
         """θ̈ = 58.86 sin θ + 1.2 u − 0.2 θ̇."""
         return WEIGHT * jnp.sin(angle) + torque / INERTIA - FRICTION * speed
 
-    def observation(self, state: Any, rng: Any = None, params: Any = None) -> Any:
+    def observation(self, state: State, rng: Any = None, params: Any = None) -> State:
         """The state itself."""
         return state
 
-    def reward(self, state: Any, action: Any, next_state: Any, rng: Any = None, params: Any = None) -> Any:
+    def reward(
+        self, state: State, action: Action, next_state: State, rng: Any = None, params: Any = None
+    ) -> Float[Array, ""]:
         """−10 θ² at the *current* state."""
         return -10.0 * wrapped(state[0]) ** 2
 
-    def terminal(self, state: Any, rng: Any = None, params: Any = None) -> Any:
+    def terminal(self, state: State, rng: Any = None, params: Any = None) -> Bool[Array, ""]:
         """Never."""
         return jnp.asarray(False)
 
-    def pose(self, observation: Any) -> list[np.ndarray]:
+    def pose(self, observation: Float[np.ndarray, " s"]) -> list[Line]:
         """The pendulum as a line in the square [−1, 1]², pivot in the middle."""
         angle = float(observation[0])
         return [np.array([[0.0, 0.0], [np.sin(angle), np.cos(angle)]])]
@@ -97,7 +104,7 @@ DYNAMICS = SwingUpDynamics()
 
 
 class SwingUp(FunctionalEnv):
-    """A pendulum to be swung up and kept upright, with a strong and noisy motor.
+    """A pendulum with a strong and noisy motor, to be swung up and kept upright.
 
     θ̈ = 58.86 sin θ + 1.2 u − 0.2 θ̇ with θ = 0 upright; control step 0.05 s.
 
