@@ -186,7 +186,7 @@ def probability_better(
     Returns:
       shape (n,).
     """
-    utilities, incumbent = _checked(utilities, incumbent)
+    utilities, incumbent = _fitting_draws(utilities, incumbent)
     return np.mean((1 + np.sign(utilities - incumbent[:, None])) / 2, axis=0)
 
 
@@ -209,7 +209,7 @@ def expected_information(
     Source: Houlsby, Huszár, Ghahramani and Lengyel (2011), "Bayesian active learning for classification and preference
     learning", eq. 2.
     """
-    utilities, incumbent = _checked(utilities, incumbent)
+    utilities, incumbent = _fitting_draws(utilities, incumbent)
     p = prob(likelihood, utilities - incumbent[:, None])
     # the estimate from the same draws is never negative but for rounding
     return np.maximum(_entropy(p.mean(axis=0)) - _entropy(p).mean(axis=0), 0.0)
@@ -220,7 +220,7 @@ def _entropy(p: np.ndarray) -> np.ndarray:
     return entr(p) + entr(np.maximum(1 - p, 0.0))
 
 
-def _checked(utilities: np.ndarray, incumbent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fitting_draws(utilities: np.ndarray, incumbent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     utilities, incumbent = np.asarray(utilities, dtype=np.float64), np.asarray(incumbent, dtype=np.float64)
     if utilities.ndim != 2 or len(utilities) == 0 or incumbent.shape != utilities.shape[:1]:
         raise ValueError(
