@@ -7,7 +7,6 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from bayespbrl.models import (
-    Candidate,
     EllipticalSlice,
     HyperparameterSearch,
     PreferenceModel,
@@ -306,14 +305,13 @@ def test_evidence_finds_the_length_scale_that_ordered_the_pairs():
     points, centres = rng.uniform(-3, 3, (120, 1)), np.linspace(-3, 3, 60)
     features = {s: np.exp(-0.5 * ((points - centres) / s) ** 2) for s in (0.05, 0.7, 20.0)}
     utility = features[0.7] @ rng.normal(size=60)
-    candidates = []
+    log_evidence = []
     for length_scale in features:
         difference = features[length_scale][:60] - features[length_scale][60:]
         difference *= np.sign(utility[:60] - utility[60:])[:, None]
-        candidates.append(Candidate(difference / np.abs(difference).max(), PreferenceModel()))
-    log_evidence = np.array([candidate.fit().log_evidence for candidate in candidates])
+        log_evidence.append(fit_gaussian(difference / np.abs(difference).max(), PreferenceModel()).log_evidence)
     assert np.argmax(log_evidence) == 1
-    assert HyperparameterSearch(np.array([list(features)]).T, log_evidence, reached=1).weights[1] > 0.9
+    assert HyperparameterSearch(np.array([list(features)]).T, np.array(log_evidence), reached=1).weights[1] > 0.9
 
 
 def test_the_climb_ends_where_no_neighbour_on_the_grid_is_more_likely_and_finds_a_length_scale_for_each_dimension():
@@ -326,13 +324,13 @@ def test_the_climb_ends_where_no_neighbour_on_the_grid_is_more_likely_and_finds_
     true_scales = np.array([0.7, 20.0])
     utility = features(true_scales) @ rng.normal(size=150)
 
-    def candidate(point):
+    def log_evidence(point):
         rows = features(np.array(point[:2]))
         difference = (rows[:80] - rows[80:]) * np.sign(utility[:80] - utility[80:])[:, None]
-        return Candidate(difference / np.abs(difference).max(), PreferenceModel(steepness=point[2]))
+        return fit_gaussian(difference / np.abs(difference).max(), PreferenceModel(steepness=point[2])).log_evidence
 
     axes = [(0.05, 0.7, 5.0, 20.0), (0.05, 0.7, 5.0, 20.0), (1.0, 5.0)]
-    search = search_hyperparameters(candidate, axes, start=(0.05, 0.05, 5.0), together=2)
+    search = search_hyperparameters(log_evidence, axes, start=(0.05, 0.05, 5.0), together=2)
     assert search.best[0] == 0.7
     assert search.best[1] >= 5.0
     found = dict(zip(map(tuple, search.points.tolist()), search.log_evidence, strict=True))
@@ -342,12 +340,12 @@ def test_the_climb_ends_where_no_neighbour_on_the_grid_is_more_likely_and_finds_
         for value in values:
             neighbour = (*search.best[:axis], value, *search.best[axis + 1 :])
             if abs(values.index(value) - values.index(search.best[axis])) == 1:
-                assert candidate(neighbour).fit().log_evidence <= found[search.best] + 1e-6
+                assert log_evidence(neighbour) <= found[search.best] + 1e-6
     np.testing.assert_allclose(search.weights.sum(), 1)
 
 
 def test_the_climb_stays_where_the_answers_say_nothing():
-    nothing = Candidate(np.zeros((3, 2)), PreferenceModel())
+    nothing = fit_gaussian(np.zeros((3, 2)), PreferenceModel()).log_evidence
     search = search_hyperparameters(lambda _: nothing, [(1.0, 2.0)], start=(2.0,))
     assert search.best == (2.0,)
     with pytest.raises(ValueError, match=r"start: expected a value of each of 1 axes, got \(3.0,\)"):

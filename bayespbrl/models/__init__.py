@@ -12,14 +12,13 @@ linear_program           eq. 10, the alternative to the posterior
 
 from bayespbrl.models.elliptical_slice_kernel import EllipticalSlice
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian
-from bayespbrl.models.hyperparameters import Candidate, HyperparameterSearch, search_hyperparameters
+from bayespbrl.models.hyperparameters import HyperparameterSearch, search_hyperparameters
 from bayespbrl.models.linear_program import LinearProgramResult, linear_program
 from bayespbrl.models.posterior import posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import restored, stored
 from bayespbrl.models.preference_model import PreferenceModel, preference_model
 
 __all__ = [
-    "Candidate",
     "EllipticalSlice",
     "GaussianFit",
     "HyperparameterSearch",

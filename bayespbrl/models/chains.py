@@ -60,7 +60,7 @@ class Chains:
         problem = padded_problem(
             loadings,
             fit.likelihood,
-            prior_scale=fit.prior_scale,
+            prior_scale=fit.model.prior_scale,
             mean=approximation.mean,
             site_precisions=site_precisions,
         )

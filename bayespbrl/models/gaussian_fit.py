@@ -21,16 +21,18 @@ class GaussianFit:
     """A posterior's thin factorisation and its Gaussian approximation.
 
     Attributes:
+      differences: Ψ, whose rows are ψ(preferred) − ψ(dominated).
+      model: prior and likelihood.
       factors: Ψ = L Qᵀ.
-      likelihood: p.
-      prior_scale: σ.
+      likelihood: p of these answers.
       approximation: expectation propagation's, of z.
       log_evidence: expectation propagation's log marginal likelihood of all answers, rows of zeros included, nats.
     """
 
+    differences: Float[np.ndarray, "k d"]
+    model: PreferenceModel
     factors: LowRank
     likelihood: Likelihood
-    prior_scale: float
     approximation: GaussianApproximation
     log_evidence: float
 
@@ -48,33 +50,23 @@ def fit_gaussian(
       differences, indifferent, number_of_preferences: as of `sample_posterior`.
       model: prior and likelihood.
     """
-    differences = checked_differences(differences)
-    number = len(differences)
+    differences = checks.matrix("differences", differences)
+    number, dimension = differences.shape
+    if dimension == 0:
+        raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
     tied = np.zeros(number, dtype=bool) if indifferent is None else np.asarray(indifferent)
     if tied.shape != (number,) or tied.dtype != bool:
         raise ValueError(f"indifferent: expected bool of shape ({number},), got {tied.dtype} of shape {tied.shape}")
     likelihood = model.answer_likelihood(number if number_of_preferences is None else number_of_preferences, tied)
     with one_blas_thread():
-        return _fit_gaussian(differences, model.prior_scale, likelihood)
-
-
-def _fit_gaussian(differences: Float[np.ndarray, "k d"], prior_scale: float, likelihood: Likelihood) -> GaussianFit:
-    factors = low_rank(differences)
-    used = used_rows(factors.loadings)
-    mixture = likelihood.probit_mixture().of(used)
-    approximation = expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale)
-    log_evidence = approximation.log_evidence
-    if not np.all(used):  # rows of zeros have a factor of their own; else nothing is compiled for a new K
-        log_evidence += float(np.sum(np.log(prob(likelihood, np.zeros(len(used)))[~used])))
-    return GaussianFit(factors, likelihood, prior_scale, approximation, log_evidence)
-
-
-def checked_differences(differences: ArrayLike) -> Float[np.ndarray, "k d"]:
-    """As float64; `ValueError` unless they are a finite matrix (K, D), D >= 1."""
-    differences = checks.matrix("differences", differences)
-    if differences.shape[1] == 0:
-        raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
-    return differences
+        factors = low_rank(differences)
+        used = used_rows(factors.loadings)
+        mixture = likelihood.probit_mixture().of(used)
+        approximation = expectation_propagation(factors.loadings[used], mixture, prior_scale=model.prior_scale)
+        log_evidence = approximation.log_evidence
+        if not np.all(used):  # rows of zeros have a factor of their own; else nothing is compiled for a new K
+            log_evidence += float(np.sum(np.log(prob(likelihood, np.zeros(number))[~used])))
+    return GaussianFit(differences, model, factors, likelihood, approximation, log_evidence)
 
 
 @cache

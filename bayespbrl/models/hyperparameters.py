@@ -1,7 +1,4 @@
-"""Length scales, prior scale and steepness by marginal likelihood.
-
-Expectation propagation estimates log p(answers | candidate) at the cost of one Gaussian fit.
-"""
+"""A climb over a grid of hyperparameters by the marginal likelihood."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,29 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
 
-from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian
-from bayespbrl.models.preference_model import PreferenceModel
-
 LEAST_GAIN = 1e-6  # nats; smaller differences of the evidence are rounding
 ROUNDS = 2  # how often each axis is gone through at most
 Point = tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One setting to be weighed.
-
-    Attributes:
-      differences: ψ(preferred) − ψ(dominated) in this candidate's features, which carry its length scales.
-      model: prior and likelihood.
-    """
-
-    differences: Float[np.ndarray, "k d"]
-    model: PreferenceModel
-
-    def fit(self) -> GaussianFit:
-        """Expectation propagation's Gaussian under this setting, with its log evidence; errors as of `fit_gaussian`."""
-        return fit_gaussian(self.differences, self.model)
 
 
 @dataclass(frozen=True)
@@ -62,7 +39,7 @@ class HyperparameterSearch:
 
 
 def search_hyperparameters(
-    candidate: Callable[[Point], Candidate],
+    log_evidence: Callable[[Point], float],
     axes: Sequence[Sequence[float]],
     *,
     start: Sequence[float],
@@ -73,7 +50,7 @@ def search_hyperparameters(
     With five length scales for each of S dimensions the grid has 5^S points, and the climb examines about 5 + 4S.
 
     Args:
-      candidate: makes the candidate of a point of the grid; its answers must be the same everywhere.
+      log_evidence: log p(answers | setting) of a point of the grid, nats, as by `fit_gaussian`.
       axes: the values of each axis, in increasing order.
       start: where to begin; each value must be in its axis.
       together: number of axes at the front, of equal values, that are first moved as one over all their values.
@@ -82,22 +59,20 @@ def search_hyperparameters(
       the points examined, and where the climb ended: at the start, where no neighbour is more likely.
 
     Raises:
-      ValueError: a start that is not on the grid; else as `fit_gaussian`.
+      ValueError: a start that is not on the grid.
     """
     if len(start) != len(axes) or any(value not in axis for value, axis in zip(start, axes, strict=True)):
         raise ValueError(f"start: expected a value of each of {len(axes)} axes, got {tuple(start)}")
     found: dict[Point, float] = {}
 
-    def weigh(point: Point) -> float:
-        if point not in found:
-            found[point] = candidate(point).fit().log_evidence
-        return found[point]
-
     def better(point: Point, best: Point) -> bool:
-        return weigh(point) > weigh(best) + LEAST_GAIN
+        for each in (best, point):
+            if each not in found:
+                found[each] = log_evidence(each)
+        return found[point] > found[best] + LEAST_GAIN
 
     best = tuple(float(value) for value in start)
-    weigh(best)
+    better(best, best)
     for value in axes[0] if together else ():
         point = (float(value),) * together + best[together:]
         best = point if better(point, best) else best

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from bayespbrl import checks
 from bayespbrl.models.chains import CHUNK, Chains
 from bayespbrl.models.convergence import chain_convergence
-from bayespbrl.models.gaussian_fit import checked_differences, fit_gaussian, one_blas_thread
+from bayespbrl.models.gaussian_fit import fit_gaussian, one_blas_thread
 from bayespbrl.models.posterior_tree import posterior_tree
 from bayespbrl.models.preference_model import PreferenceModel
 
@@ -105,20 +105,9 @@ def posterior_draws(
     sampler: SamplerOptions | None = None,
 ) -> xr.DataTree:
     """`sample_posterior` for a model that is at hand; `sampler` None takes the default `SamplerOptions`."""
-    differences = checked_differences(differences)
     seed = checks.whole("seed", seed, 0)
     sampler = SamplerOptions() if sampler is None else sampler
-    number_of_preferences = len(differences) if number_of_preferences is None else number_of_preferences
     fit = fit_gaussian(differences, model, indifferent=indifferent, number_of_preferences=number_of_preferences)
-    settings: dict[str, float | str] = {
-        "prior_scale": float(model.prior_scale),
-        "steepness": float(model.steepness),
-        "lapse_rate": float(model.lapse_rate),
-        "likelihood": model.likelihood,
-        "number_of_preferences": int(number_of_preferences),
-        "tie_threshold": float("nan") if model.tie_threshold is None else float(model.tie_threshold),
-        "seed": seed,
-    }
     with jax.enable_x64(True), one_blas_thread():
         chunk = min(sampler.num_samples, CHUNK)
         chains = Chains.start(fit, num_chains=sampler.num_chains, chunk=chunk, seed=seed)
@@ -130,4 +119,5 @@ def posterior_draws(
             if report.converged() or 2 * wanted > sampler.max_samples:
                 break
             wanted *= 2
-    return posterior_tree(differences, fit, chains, wanted, report, settings)
+    number = len(fit.differences) if number_of_preferences is None else number_of_preferences
+    return posterior_tree(fit, chains, wanted, report, {"number_of_preferences": int(number), "seed": seed})

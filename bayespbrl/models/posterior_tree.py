@@ -1,6 +1,7 @@
 """A posterior as a DataTree in ArviZ's schema, to keep in memory and on disk."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -16,19 +17,11 @@ from bayespbrl.models.low_rank import UtilityWeights, low_rank
 
 
 def posterior_tree(
-    differences: Float[np.ndarray, "k d"],
-    fit: GaussianFit,
-    chains: Chains,
-    length: int,
-    report: Convergence,
-    settings: Mapping[str, float | str],
+    fit: GaussianFit, chains: Chains, length: int, report: Convergence, attributes: Mapping[str, int]
 ) -> xr.DataTree:
     """The first `length` draws of the chains, with the groups that `sample_posterior` describes.
 
-    Args:
-      differences, fit: as the chains began.
-      report: of the margins' draws.
-      settings: model, seed and number of preferences, which become attributes.
+    `fit` is where the chains began, `report` of the margins' draws, and `attributes` are kept with the tree.
     """
     sample, answer = ("chain", "draw"), ("chain", "draw", "preference")
     z, answers, stuck, candidates = (
@@ -37,29 +30,34 @@ def posterior_tree(
     lp = np.sum(answers, axis=2)
     labels = {"chain": np.arange(z.shape[0]), "draw": np.arange(length)}
     likelihood, basis = fit.likelihood, fit.factors.basis
-    tied = np.asarray(likelihood.indifferent) if isinstance(likelihood, WithTies) else np.zeros(len(differences), bool)
+    tied = (
+        np.asarray(likelihood.indifferent) if isinstance(likelihood, WithTies) else np.zeros(len(fit.differences), bool)
+    )
     most_likely = z[np.unravel_index(np.argmax(lp), lp.shape)]
     points = {"mean": basis @ z.mean(axis=(0, 1)), "most_likely": basis @ most_likely}
-    attributes = {
+    root_attributes = {
+        **{
+            name: x if isinstance(x, str) else float("nan" if x is None else x) for name, x in asdict(fit.model).items()
+        },
+        **attributes,
         "log_evidence": fit.log_evidence,
         "log_evidence_converged": int(fit.approximation.converged),
         "rhat_max": report.rhat_max,
         "effective_sample_size_min": min(report.effective_sample_size_min, float(lp.size)),
         "converged": int(report.converged()),
         "stuck": int(np.sum(stuck)),
-        **settings,
     }
     draws = {"margins": (answer, z @ fit.factors.loadings.T), "coordinates": ((*sample, "coordinate"), z)}
     statistics = {"lp": (sample, lp), "candidates": (sample, candidates), "stuck": (sample, stuck)}
-    root = xr.Dataset({f"utility_weights_{name}": ("feature", w) for name, w in points.items()}, attrs=attributes)
+    root = xr.Dataset({f"utility_weights_{name}": ("feature", w) for name, w in points.items()}, attrs=root_attributes)
     return xr.DataTree.from_dict(
         {
             "/": root,
-            "/posterior": _with_weights(xr.Dataset(draws, labels), basis, attributes),
+            "/posterior": _with_weights(xr.Dataset(draws, labels), basis, root_attributes),
             "/sample_stats": xr.Dataset(statistics, labels),
             "/log_likelihood": xr.Dataset({"answers": (answer, answers)}, labels),
             "/observed_data": xr.Dataset({"answers": ("preference", (~tied).astype(np.int8))}),
-            "/constant_data": xr.Dataset({"differences": (("preference", "feature"), differences)}),
+            "/constant_data": xr.Dataset({"differences": (("preference", "feature"), fit.differences)}),
         }
     )
 

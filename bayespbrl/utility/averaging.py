@@ -197,5 +197,5 @@ def _draw(fit: GaussianFit, rng: np.random.Generator) -> np.ndarray:
     basis, approximation = fit.factors.basis, fit.approximation
     values, directions = np.linalg.eigh(approximation.covariance)
     z = approximation.mean + directions @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-    noise = fit.prior_scale * rng.standard_normal(len(basis))
+    noise = fit.model.prior_scale * rng.standard_normal(len(basis))
     return basis @ (z - basis.T @ noise) + noise

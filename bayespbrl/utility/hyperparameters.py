@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayespbrl.features import StateFeatures
-from bayespbrl.models import Candidate, PreferenceModel, search_hyperparameters
+from bayespbrl.models import PreferenceModel, fit_gaussian, search_hyperparameters
 from bayespbrl.utility.comparisons import Comparisons, number_of_bandwidths, rescaled
 
 # The grid: multiples of the bandwidths and of the steepness as given, and lapse rates. The posterior depends on σ and m
@@ -66,17 +66,17 @@ def choose_hyperparameters(
     def with_values(steepness: float, lapse_rate: float) -> PreferenceModel:
         return replace(model, steepness=model.steepness * steepness, lapse_rate=lapse_rate)
 
-    def candidate(point: tuple[float, ...]) -> Candidate:
+    def log_evidence(point: tuple[float, ...]) -> float:
         multiples = point[:dimensions]
         if multiples not in differences:
             differences[multiples] = comparisons.scaled_differences(rescaled(features, multiples))[0]
-        return Candidate(differences[multiples], with_values(*point[dimensions:]))
+        return fit_gaussian(differences[multiples], with_values(*point[dimensions:])).log_evidence
 
     start = (*[1.0] * dimensions, 1.0, float(model.lapse_rate))
     if not comparisons.pairs:
         return HyperparameterChoice(features, model, start[:dimensions])
     axes = [*[BANDWIDTH_MULTIPLES] * dimensions, STEEPNESS_MULTIPLES, sorted({*LAPSE_RATES, float(model.lapse_rate)})]
-    search = search_hyperparameters(candidate, axes, start=start, together=dimensions)
+    search = search_hyperparameters(log_evidence, axes, start=start, together=dimensions)
     return HyperparameterChoice(
         rescaled(features, search.best[:dimensions]),
         with_values(*search.best[dimensions:]),
