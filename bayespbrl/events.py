@@ -1,12 +1,12 @@
-"""What happens in a run, and the learner's state that follows from it: a fold over an append-only log.
+"""The events of a run and the learner's state: the state is a fold over an append-only log of events.
 
-Resume, undo, a person who answers next week and a report on a run in progress are all this fold. Five events:
+Resuming a run, undoing an answer and reporting on a run in progress all use this fold. There are five events:
 
-* `collected`: step 3 brought new trajectories, and these of them are to be asked about, in this order;
-* `asked`: a question was put, with the order in which the two were shown;
-* `answered`: the expert said something;
-* `improved`: steps 1 and 2 made a new estimate and a new policy: the end of an iteration;
-* `undone`: the last answer was taken back, and everything that followed from it.
+* `collected`: new trajectories (step 3), and which of them to ask about, in order (step 4);
+* `asked`: a question, with the order in which the two trajectories were shown;
+* `answered`: the expert's answer;
+* `improved`: a new estimate and a new policy (steps 1 and 2), which end an iteration;
+* `undone`: the last answer and everything after it is taken back.
 """
 
 import math
@@ -29,7 +29,7 @@ class Entry:
 
     Attributes:
       event: plain data, one line of the log.
-      parts: `collected` brings `trajectories`; `improved` brings `trajectories`, `policy` and `estimate`.
+      parts: `trajectories` of `collected`; `trajectories`, `policy` and `estimate` of `improved`.
     """
 
     event: Mapping[str, Any]
@@ -37,14 +37,14 @@ class Entry:
 
 
 class Log(Protocol):
-    """Where entries go before the learner moves on, with the state that each leads to."""
+    """Keeps each entry, and the state after it, before the learner moves on."""
 
     def append(self, entry: Entry, state: "LearnerState") -> None: ...
 
 
 @dataclass(frozen=True)
 class LearnerState:
-    """Everything the learner knows between two calls.
+    """What the learner knows between two calls.
 
     Attributes:
       policy: the current policy.
@@ -55,11 +55,11 @@ class LearnerState:
       preferences: the answers so far.
       collected: whether the next iteration's trajectories are among them.
       candidates: trajectories to ask about in this iteration, best first.
-      wanted: answers still wanted in this iteration.
-      unasked: iterations in a row, up to now, that wanted none.
-      query: the question that waits for an answer.
-      queries: questions put so far.
-      shown: the trajectories that some question showed.
+      wanted: number of answers still wanted in this iteration.
+      unasked: number of consecutive iterations, up to now, without a question.
+      query: the question that waits for an answer; None if none does.
+      queries: number of questions so far.
+      shown: the trajectories that were shown in some question.
       summaries: one for each completed iteration.
       previous: the state before the last answer.
     """
@@ -85,7 +85,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
     """The state after one more event.
 
     Raises:
-      ValueError: an event there is not, or one that cannot follow this state.
+      ValueError: an unknown event, or one that cannot follow this state.
     """
     event = entry.event
     match event.get("event"):
@@ -124,7 +124,7 @@ def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
     """The state after all of `entries`.
 
     Raises:
-      ValueError: as `apply`; also an event that lacks what it should say, as in a foreign log.
+      ValueError: as `apply`; also an incomplete event, as in a foreign log.
     """
     for entry in entries:
         try:
@@ -136,9 +136,9 @@ def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
 
 
 def surviving(log: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The events that lead to the same state without any undoing.
+    """The events without those that were undone, which lead to the same state.
 
-    What was undone is left out, and not only to save time: its heavy parts may have been written over since.
+    The heavy parts of an undone event may have been overwritten since, so it cannot be replayed.
 
     Raises:
       ValueError: an `undone` without an answer before it.
@@ -185,7 +185,7 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
 
 
 def plain(value: Any) -> Any:
-    """An event as it will be read back from JSON: NumPy numbers as Python's, what is not finite as None."""
+    """`value` as JSON gives it back: NumPy numbers as Python's, tuples as lists, NaN and infinity as None."""
     if isinstance(value, dict):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

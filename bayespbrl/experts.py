@@ -1,8 +1,7 @@
-"""Experts: whoever says which of two trajectories is better (paper, step 4).
+"""Experts: simulated ones and a person at a terminal, who answer which of two trajectories is better (paper, step 4).
 
-An expert is any callable of two trajectories, in the order shown, that returns an `Answer` or its string. It must
-not remember: the same two trajectories get the same answer, so that a run that was stopped continues as if it had
-not been.
+An expert is any callable of two trajectories, in the order shown, that returns an `Answer` or its string. The answer
+must depend on the two trajectories only: a resumed run may ask a question again.
 """
 
 import zlib
@@ -13,14 +12,15 @@ from typing import Protocol
 
 import numpy as np
 
+from bayespbrl import checks
 from bayespbrl.preferences import Answer, parse_answer
 from bayespbrl.trajectories import Trajectory
 
-TIE_TOLERANCE = 1e-9  # relative: sums in another order must not decide
+TIE_TOLERANCE = 1e-9  # relative: rounding in another order of summation must not decide
 
 
 class Expert(Protocol):
-    """Anything that answers "which of these two is better?"."""
+    """A callable that answers "which of these two is better?"."""
 
     def __call__(self, first: Trajectory, second: Trajectory, /) -> Answer | str: ...
 
@@ -37,14 +37,14 @@ class ReturnExpert:
 
 @dataclass(frozen=True)
 class NoisyExpert:
-    """An expert who errs: turns a share of another expert's decided answers round.
+    """Another expert whose answers are reversed at random; ties and skips stay as they are.
 
-    Which answers are wrong is a fixed function of `seed` and the two trajectories, whichever is shown first.
+    Whether an answer is reversed is a function of `seed` and the two trajectories, in either order.
 
     Attributes:
-      expert: whose answers to spoil.
-      wrong_answers: probability of a wrong answer, in [0, 1].
-      seed: a non-negative integer.
+      expert: gives the right answers.
+      wrong_answers: probability that an answer is reversed, in [0, 1].
+      seed: a whole number >= 0.
     """
 
     expert: Expert
@@ -52,10 +52,8 @@ class NoisyExpert:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.wrong_answers <= 1:
-            raise ValueError(f"wrong_answers: expected a share in [0, 1], got {self.wrong_answers}")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise ValueError(f"seed: expected a whole number >= 0, got {self.seed!r}")
+        checks.share("wrong_answers", self.wrong_answers)
+        checks.whole("seed", self.seed, 0)
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
         answer = parse_answer(self.expert(first, second))
@@ -66,7 +64,7 @@ class NoisyExpert:
 
 
 def simulated_expert(wrong_answers: float = 0.0, *, seed: int = 0) -> Expert:
-    """`ReturnExpert`, or a `NoisyExpert` over it where some answers are to be wrong."""
+    """`ReturnExpert`, as a `NoisyExpert` where `wrong_answers`, the probability of a wrong answer, is positive."""
     return NoisyExpert(ReturnExpert(), wrong_answers, seed) if wrong_answers else ReturnExpert()
 
 
@@ -76,12 +74,12 @@ KEYS = {"1": Answer.FIRST, "2": Answer.SECOND, "t": Answer.TIE, "s": Answer.SKIP
 
 @dataclass(frozen=True)
 class TerminalExpert:
-    """A person at the prompt, who looks at a picture of the two trajectories on disk.
+    """A person at a terminal, who looks at a picture of the two trajectories on disk.
 
     Attributes:
       draw: writes a picture of the two trajectories, in the order shown, to a path.
-      folder: where the picture `query.png` is written anew for each question.
-      read: asks for a line of text; `input` unless told.
+      folder: of the picture `query.png`, which is overwritten for each question.
+      read: prompts for a line of text.
     """
 
     draw: Callable[[Trajectory, Trajectory, Path], None]
@@ -89,7 +87,7 @@ class TerminalExpert:
     read: Callable[[str], str] = input
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
-        """The person's answer; raises `KeyboardInterrupt` when they want to stop (also at the end of input)."""
+        """The person's answer; raises `KeyboardInterrupt` where they stop or the input ends."""
         self.folder.mkdir(parents=True, exist_ok=True)
         picture = self.folder / "query.png"
         self.draw(first, second, picture)

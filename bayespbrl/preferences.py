@@ -1,26 +1,27 @@
-"""Preferences ζ: what was asked, what was answered, and which trajectories are undominated (paper, step 4)."""
+"""Preferences ζ: questions, answers, the ordered pairs and the undominated trajectories (paper, step 4)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from jaxtyping import Float
 
 from bayespbrl.trajectories import Trajectory
 
 
 class Answer(StrEnum):
-    """What an expert may say of two trajectories, in the order in which they were shown."""
+    """An expert's answer about two trajectories, in the order in which they were shown."""
 
     FIRST = "first"
     SECOND = "second"
     TIE = "tie"
-    SKIP = "skip"  # cannot tell: not counted, another trajectory is asked about instead
-    UNDO = "undo"  # takes the previous answer back; its question is asked again
+    SKIP = "skip"  # no answer: the question does not count, and another trajectory is asked about
+    UNDO = "undo"  # takes the previous answer back, and its question is asked again
 
 
 def parse_answer(answer: object) -> Answer:
-    """`answer` as an `Answer`; raises `ValueError` naming what the expert returned otherwise."""
+    """`answer` as an `Answer`; `ValueError` where it is none."""
     try:
         return Answer(answer)  # type: ignore[arg-type]
     except ValueError:
@@ -30,13 +31,13 @@ def parse_answer(answer: object) -> Answer:
 
 @dataclass(frozen=True)
 class Query:
-    """One question: which of these two?
+    """A question: which of two trajectories is better?
 
     Attributes:
-      number: counts the questions of a run from 1.
-      first, second: the numbers of the two trajectories in the order shown, which is drawn at random.
-      newcomer: which of the two was not shown before; the other is the newest of the undominated.
-      trajectories: the two themselves, in the order shown.
+      number: of the question in its run, from 1.
+      first, second: numbers of the two trajectories in the order shown, which is drawn at random.
+      newcomer: number of the new one; the other is the newest undominated trajectory.
+      trajectories: the two trajectories, in the order shown.
     """
 
     number: int
@@ -52,12 +53,12 @@ class Query:
 
 @dataclass(frozen=True)
 class Preferences:
-    """Ordered pairs and the set of undominated trajectories; trajectories are named by their numbers.
+    """The ordered pairs and the undominated trajectories, by the numbers of the trajectories.
 
     Attributes:
-      pairs: (preferred, dominated), one for each τᵢ ≻ τⱼ; their number is K of eq. 8.
+      pairs: (preferred, dominated) for each τᵢ ≻ τⱼ; there are K of them (eq. 8).
       undominated: the best so far, which tie with each other; the newest last.
-      answers: comparisons asked and answered, ties included.
+      answers: number of answered questions, ties included.
     """
 
     pairs: tuple[tuple[int, int], ...] = ()
@@ -65,15 +66,15 @@ class Preferences:
     answers: int = 0
 
     def start(self, trajectory: int) -> "Preferences":
-        """The same with `trajectory` as the first undominated one, to compare others with."""
+        """The same preferences with `trajectory` as the first undominated one."""
         return replace(self, undominated=(trajectory,))
 
     def add(self, newcomer: int, incumbent: int, *, preferred: int | None) -> "Preferences":
         """The preferences after one comparison of a newcomer with the newest undominated trajectory.
 
-        Better: preferred over every undominated trajectory, and alone undominated. Worse: every one of them is
-        preferred over it. Tie (`preferred=None`): it joins them and no ordered pair is stored (the authors'
-        published implementation).
+        A better newcomer is preferred over every undominated trajectory and replaces them. Over a worse one, every
+        undominated trajectory is preferred. In a tie (`preferred=None`) the newcomer joins them, and no ordered pair is
+        stored, as in the authors' published implementation.
 
         Raises:
           ValueError: an incumbent that is not the newest undominated one, or a preferred that is neither of the two.
@@ -91,16 +92,18 @@ class Preferences:
         new_pairs = tuple((member, newcomer) for member in self.undominated)
         return Preferences(self.pairs + new_pairs, self.undominated, answers)
 
-    def differences(self, trajectory_features: np.ndarray) -> np.ndarray:
-        """ψ(preferred) − ψ(dominated) of eq. 5, shape (K, D), from ψ of all trajectories, shape (n, D)."""
+    def differences(self, trajectory_features: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
+        """ψ(preferred) − ψ(dominated) for each pair (eq. 5), from ψ of all trajectories."""
         return pair_differences(self.pairs, trajectory_features)
 
 
-def pair_differences(pairs: Sequence[tuple[int, int]], trajectory_features: np.ndarray) -> np.ndarray:
-    """ψ(preferred) − ψ(dominated) for each of K pairs, shape (K, D).
+def pair_differences(
+    pairs: Sequence[tuple[int, int]], trajectory_features: Float[np.ndarray, "n d"]
+) -> Float[np.ndarray, "k d"]:
+    """ψ(preferred) − ψ(dominated) for each of K pairs (eq. 5).
 
     Raises:
-      ValueError: a pair that names a trajectory there is not, or one trajectory twice.
+      ValueError: a pair with an unknown trajectory, or with the same one twice.
     """
     numbers = np.asarray(pairs, dtype=np.int64).reshape(len(pairs), 2)
     if np.any(numbers < 0) or np.any(numbers >= len(trajectory_features)):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bayespbrl.events import Entry, LearnerState, apply, plain, replay, surviving
+from bayespbrl.improvement.schedules import Bound
 from bayespbrl.trajectories import Trajectory
 
 
@@ -29,8 +30,13 @@ def answered(query, answer):
     return Entry({"event": "answered", "query": query, "answer": answer})
 
 
+def summary(iteration):
+    schedule = {"reason": "confidence", "signal": iteration / 8, "gain": 0.25}
+    return {"iteration": iteration, "kl_bound": iteration / 4, "schedule": schedule}
+
+
 def improved(iteration):
-    event = {"event": "improved", "iteration": iteration, "summary": {"iteration": iteration}}
+    event = {"event": "improved", "iteration": iteration, "summary": summary(iteration)}
     return Entry(event, {"policy": f"policy {iteration}", "estimate": f"estimate {iteration}"})
 
 
@@ -58,7 +64,8 @@ def test_two_iterations_by_hand():
     assert state.preferences.answers == 3
     assert (state.iteration, state.queries, len(state.trajectories)) == (2, 3, 5)
     assert (state.policy, state.estimate) == ("policy 2", "estimate 2")
-    assert state.summaries == ({"iteration": 1}, {"iteration": 2})
+    assert state.summaries == (summary(1), summary(2))
+    assert state.bound == Bound(kl_bound=0.5, reason="confidence", signal=0.25, statistics={"gain": 0.25})
     assert (state.collected, state.query, state.candidates, state.wanted) == (False, None, (), 0)
 
 
@@ -104,7 +111,8 @@ def test_undoing_leads_to_the_state_before_the_last_answer(length):
     last = max(i for i, entry in enumerate(HISTORY[:length]) if entry.event["event"] == "answered")
     undone, never = replay(START, (*HISTORY[:length], UNDONE)), replay(START, HISTORY[:last])
     assert undone.query.number == never.query.number
-    for name in ("policy", "estimate", "iteration", "preferences", "candidates", "wanted", "queries", "summaries"):
+    names = ("policy", "estimate", "bound", "iteration", "preferences", "candidates", "wanted", "queries", "summaries")
+    for name in names:
         assert getattr(undone, name) == getattr(never, name)
     assert len(undone.trajectories) == len(never.trajectories)
 

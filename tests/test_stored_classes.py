@@ -82,9 +82,7 @@ def test_what_is_not_finite_comes_back(tmp_path):
         OneHot(25),
         RadialBasis(np.random.default_rng(1).normal(size=(4, 2)), np.array([0.3, 0.7]), np.array([np.inf, 6.28])),
         TabularPolicy(np.random.default_rng(2).dirichlet(np.ones(3), 5)),
-        LinearGaussianPolicy(
-            np.ones((1, 3)), np.zeros(2), np.ones(2), np.eye(1), np.ones(1), np.asarray(0.01), "diagonal"
-        ),
+        LinearGaussianPolicy(np.ones((1, 3)), np.zeros(2), np.ones(2), np.eye(1), np.ones(1), np.asarray(0.01)),
     ],
 )
 def test_features_and_policies_come_back_exactly(instance, tmp_path):

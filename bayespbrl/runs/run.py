@@ -10,12 +10,14 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import rollouts
-from bayespbrl.envs.opening import from_plain, to_plain
-from bayespbrl.improvement.schedules import ConstantBound
+from bayespbrl.envs.opening import AnyEnvironment, from_plain, to_plain
+from bayespbrl.features import StateFeatures
+from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
+from bayespbrl.policies import Policy
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
-from bayespbrl.queries import highest_utility
+from bayespbrl.queries import QueryRule, highest_utility
 from bayespbrl.runs.directory import RunDirectory, fresh_directory
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
@@ -23,13 +25,13 @@ from bayespbrl.utility import UtilityEstimate
 
 
 def start(
-    env: Any,
+    env: AnyEnvironment,
     directory: Path | str | None = None,
     *,
-    features: Any = None,
-    policy: Any = None,
-    schedule: Any = None,
-    query: Any = None,
+    features: StateFeatures | None = None,
+    policy: Policy | str | None = None,
+    schedule: Schedule | str | None = None,
+    query: QueryRule | str | None = None,
     **options: Any,
 ) -> Learner:
     """A new learner that keeps its events in a run directory.
@@ -53,11 +55,11 @@ def start(
 def resume(
     directory: Path | str,
     *,
-    env: Any = None,
-    features: Any = None,
-    policy: Any = None,
-    schedule: Any = None,
-    query: Any = None,
+    env: AnyEnvironment | None = None,
+    features: StateFeatures | None = None,
+    policy: Policy | None = None,
+    schedule: Schedule | None = None,
+    query: QueryRule | None = None,
 ) -> Learner:
     """The learner of a run directory after its last complete event; it keeps further events there.
 
@@ -78,11 +80,11 @@ def resume(
 def load(
     directory: Path | str,
     *,
-    env: Any = None,
-    features: Any = None,
-    policy: Any = None,
-    schedule: Any = None,
-    query: Any = None,
+    env: AnyEnvironment | None = None,
+    features: StateFeatures | None = None,
+    policy: Policy | None = None,
+    schedule: Schedule | None = None,
+    query: QueryRule | None = None,
 ) -> "Run":
     """A run, finished or in progress, read without changing it. Arguments and errors as of `resume`.
 
@@ -96,7 +98,14 @@ def load(
     return Run(log.path, _restored(log, env, features, policy, schedule, query))
 
 
-def _restored(log: RunDirectory, env: Any, features: Any, policy: Any, schedule: Any, query: Any) -> Learner:
+def _restored(
+    log: RunDirectory,
+    env: AnyEnvironment | None,
+    features: StateFeatures | None,
+    policy: Policy | None,
+    schedule: Schedule | None,
+    query: QueryRule | None,
+) -> Learner:
     settings = log.settings
     for part, own, given in (
         ("features", settings.features.features, features),

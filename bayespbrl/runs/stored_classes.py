@@ -1,7 +1,7 @@
 """Policies, features and estimates as xarray trees, and back: how a run stores frozen dataclasses.
 
 Arrays become variables, nested dataclasses become groups, and all other fields together become one JSON attribute.
-Nothing is pickled: a file holds arrays and numbers, which are put into a class that `STORED` names or the caller passed.
+Nothing is pickled: a file holds arrays and numbers, for a class that `STORED` names or that the caller passed.
 """
 
 import dataclasses
