@@ -91,17 +91,17 @@ class AcrobotDynamics(FuncEnv):
         )
         return jnp.stack([-(d2 * second + phi1) / d1, second])
 
-    def observation(self, state: State, rng: Any = None, params: Any = None) -> State:
+    def observation(self, state: State, rng: Array | None = None, params: Any = None) -> State:
         """The state itself."""
         return state
 
     def reward(
-        self, state: State, action: Action, next_state: State, rng: Any = None, params: Any = None
+        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: Any = None
     ) -> Float[Array, ""]:
         """−1 a step. Decision: the step that reaches the goal included, so that −return is the number of steps."""
         return jnp.asarray(-1.0)
 
-    def terminal(self, state: State, rng: Any = None, params: Any = None) -> Bool[Array, ""]:
+    def terminal(self, state: State, rng: Array | None = None, params: Any = None) -> Bool[Array, ""]:
         """The tip more than 1 m above the first joint."""
         return -LENGTH_1 * jnp.cos(state[0]) - LENGTH_2 * jnp.cos(state[0] + state[1]) > GOAL_HEIGHT
 
@@ -114,7 +114,7 @@ class AcrobotDynamics(FuncEnv):
             np.stack([elbow, elbow + 0.5 * np.array([np.sin(both), -np.cos(both)])]),
         ]
 
-    def draw(self, observation: Any, axes: Any) -> None:
+    def draw(self, observation: Float[np.ndarray, " s"], axes: Any) -> None:
         """Both links, and the height that the tip must pass."""
         axes.axhline(0.5 * GOAL_HEIGHT, linestyle=":", color="tab:green")
         draw_pose(self.pose(observation), axes)

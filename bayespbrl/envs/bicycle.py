@@ -100,21 +100,21 @@ class BicycleDynamics(FuncEnv):
         steering_acceleration = (torque - INERTIA_TYRE * SPIN * lean_speed) / INERTIA_STEERING  # θ̈
         return steering_acceleration, (tilting - righting) / INERTIA_BICYCLE  # ω̈
 
-    def observation(self, state: State, rng: Any = None, params: Any = None) -> State:
+    def observation(self, state: State, rng: Array | None = None, params: Any = None) -> State:
         """The state itself."""
         return state
 
     def reward(
-        self, state: State, action: Action, next_state: State, rng: Any = None, params: Any = None
+        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: Any = None
     ) -> Float[Array, ""]:
         """−(ω′·15/π)² − 100·[fallen]. Decision: of several in the sources, the one that tells good riders apart."""
         return -((next_state[2] / FALL_ANGLE) ** 2) - 100.0 * self.terminal(next_state)
 
-    def terminal(self, state: State, rng: Any = None, params: Any = None) -> Bool[Array, ""]:
+    def terminal(self, state: State, rng: Array | None = None, params: Any = None) -> Bool[Array, ""]:
         """The bicycle leans further than 12°."""
         return jnp.abs(state[2]) > FALL_ANGLE
 
-    def draw(self, observation: Any, axes: Any) -> None:
+    def draw(self, observation: Float[np.ndarray, " s"], axes: Any) -> None:
         """From behind: the lean (magnified three times, with the fall's limits dotted) and the handlebar from above."""
         steering, lean = float(observation[0]), 3 * float(observation[2])
         for limit in (-3 * FALL_ANGLE, 3 * FALL_ANGLE):

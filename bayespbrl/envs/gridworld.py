@@ -49,17 +49,17 @@ class GridworldDynamics(FuncEnv):
         row, column = jnp.clip(row + change[0], 0, SIZE - 1), jnp.clip(column + change[1], 0, SIZE - 1)
         return SIZE * row + column
 
-    def observation(self, state: Cell, rng: Any = None, params: Any = None) -> Cell:
+    def observation(self, state: Cell, rng: Array | None = None, params: Any = None) -> Cell:
         """The state itself."""
         return state
 
     def reward(
-        self, state: Cell, action: Cell, next_state: Cell, rng: Any = None, params: Any = None
+        self, state: Cell, action: Cell, next_state: Cell, rng: Array | None = None, params: Any = None
     ) -> Float[Array, ""]:
         """The reward of the *next* cell."""
         return jnp.asarray(REWARDS.reshape(-1))[next_state]
 
-    def terminal(self, state: Cell, rng: Any = None, params: Any = None) -> Bool[Array, ""]:
+    def terminal(self, state: Cell, rng: Array | None = None, params: Any = None) -> Bool[Array, ""]:
         """Never."""
         return jnp.zeros_like(state, dtype=bool)
 
@@ -72,7 +72,7 @@ class GridworldDynamics(FuncEnv):
         table[states, actions, moved] += 1 - STAY_PROBABILITY
         return table
 
-    def draw(self, observation: Any, axes: Any) -> None:
+    def draw(self, observation: np.int64, axes: Any) -> None:
         """One position on the grid; the hidden reward is not shown, because who judges must not see it."""
         _draw_grid(axes)
         row, column = divmod(int(observation), SIZE)

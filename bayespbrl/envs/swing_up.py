@@ -71,17 +71,17 @@ class SwingUpDynamics(FuncEnv):
         """θ̈ = 58.86 sin θ + 1.2 u − 0.2 θ̇."""
         return WEIGHT * jnp.sin(angle) + torque / INERTIA - FRICTION * speed
 
-    def observation(self, state: State, rng: Any = None, params: Any = None) -> State:
+    def observation(self, state: State, rng: Array | None = None, params: Any = None) -> State:
         """The state itself."""
         return state
 
     def reward(
-        self, state: State, action: Action, next_state: State, rng: Any = None, params: Any = None
+        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: Any = None
     ) -> Float[Array, ""]:
         """−10 θ² at the *current* state."""
         return -10.0 * wrapped(state[0]) ** 2
 
-    def terminal(self, state: State, rng: Any = None, params: Any = None) -> Bool[Array, ""]:
+    def terminal(self, state: State, rng: Array | None = None, params: Any = None) -> Bool[Array, ""]:
         """Never."""
         return jnp.asarray(False)
 
@@ -90,7 +90,7 @@ class SwingUpDynamics(FuncEnv):
         angle = float(observation[0])
         return [np.array([[0.0, 0.0], [np.sin(angle), np.cos(angle)]])]
 
-    def draw(self, observation: Any, axes: Any) -> None:
+    def draw(self, observation: Float[np.ndarray, " s"], axes: Any) -> None:
         """The pendulum, seen from the front."""
         draw_pose(self.pose(observation), axes)
         axes.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal", xticks=[], yticks=[])
