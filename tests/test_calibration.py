@@ -6,12 +6,25 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.special import expit, logit
 
-import bayespbrl.models as models
-from bayespbrl.diagnostics import calibration, plot_calibration, prequential_predictions, score_predictions
-from bayespbrl.models import sample_posterior
+from bayespbrl.diagnostics import (
+    calibration,
+    plot_calibration,
+    predictions,
+    prequential_predictions,
+    score_predictions,
+)
+from bayespbrl.models import PreferenceModel, posterior_draws, sample_posterior
+from bayespbrl.models.posterior import SamplerOptions
 
 SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+FEW = {"num_warmup": 25, "num_samples": 25, "max_samples": 25}  # where any draws will do
 DIFFERENCES = np.array([[0.9, -0.4], [0.5, 0.8], [-0.2, 0.7]])
+
+
+@pytest.fixture(scope="module")
+def tree():
+    """A posterior of eq. 8 given all differences."""
+    return sample_posterior(DIFFERENCES, **FEW)
 
 
 def forecasts_and_answers(number, seed=0):
@@ -21,7 +34,7 @@ def forecasts_and_answers(number, seed=0):
     return forecasts, rng.random(number) < forecasts
 
 
-def log_evidence(differences, likelihood):
+def log_marginal_likelihood(differences, likelihood):
     """By the trapezoidal rule over w in the plane, no point of the grid at a jump."""
     line = np.linspace(-7.003, 7.001, 1501)
     x, y = np.meshgrid(line, line, indexing="ij")
@@ -107,7 +120,7 @@ def test_equal_forecasts_are_one_point_of_the_curve_in_whatever_order_they_come(
     np.testing.assert_allclose(pooled["frequency"], [0.5, 0.5])  # of four answers, not of two forecasts
 
 
-def test_a_sure_prediction_that_fails_costs_everything_and_one_that_holds_nothing():
+def test_a_certain_prediction_scores_zero_if_right_and_minus_infinity_if_wrong():
     held, failed = (score_predictions(np.array([1.0, 0.0]), np.array([held, False])) for held in (True, False))
     assert float(held["log_score"]) == 0
     assert float(held["log_score_sd"]) == 0
@@ -119,33 +132,31 @@ def test_a_sure_prediction_that_fails_costs_everything_and_one_that_holds_nothin
     [("mixed", lambda t: (2 * (t > 0) + expit(5 * t)) / 3), ("logistic", lambda t: expit(5 * t))],
     ids=["eq. 8", "logistic"],
 )
-def test_log_scores_of_the_answers_in_turn_sum_to_the_log_evidence(likelihood, p):
+def test_log_scores_of_the_answers_in_turn_sum_to_the_log_marginal_likelihood(likelihood, p):
     first = np.array([True, False, False])
-    predicted = prequential_predictions(DIFFERENCES, first, likelihood=likelihood, **SAMPLING)
+    predicted = prequential_predictions(DIFFERENCES, first, PreferenceModel(likelihood=likelihood), **SAMPLING)
     assert predicted[0] == pytest.approx(0.5, abs=1e-12)
     score = float(score_predictions(predicted, first)["log_score"])
-    assert score == pytest.approx(log_evidence(DIFFERENCES, p), abs=0.03)
+    assert score == pytest.approx(log_marginal_likelihood(DIFFERENCES, p), abs=0.03)
 
 
 def test_calibration_of_a_posterior_predicts_with_its_own_model_by_refits():
-    options = {"likelihood": "mixed", "steepness": 2.0, "prior_scale": 1.7, "seed": 3}
+    model = PreferenceModel(likelihood="mixed", steepness=2.0, prior_scale=1.7)
     first = np.array([True, False, False])
-    tree = sample_posterior(DIFFERENCES, **options, **SAMPLING)
-    result = calibration(tree, first, **SAMPLING)
-    np.testing.assert_array_equal(
-        result["predicted"], prequential_predictions(DIFFERENCES, first, **options, **SAMPLING)
-    )
+    tree = posterior_draws(DIFFERENCES, model, seed=3, sampler=SamplerOptions(**FEW))
+    result = calibration(tree, first, **FEW)
+    direct = prequential_predictions(DIFFERENCES, first, model, seed=3, **FEW)
+    np.testing.assert_array_equal(result["predicted"], direct)
     np.testing.assert_array_equal(result["observed"], first)
     assert result.attrs["order"] == "given"
-    drawn = calibration(tree, **SAMPLING)
+    drawn = calibration(tree, **FEW)
     assert drawn.attrs["order"] == "drawn"
     assert float(drawn["log_score"]) == pytest.approx(float(result["log_score"]), abs=1e-9)
     assert float(drawn["brier_score"]) == pytest.approx(float(result["brier_score"]), abs=1e-9)
 
 
-def test_predictions_that_a_run_made_are_scored_as_they_are(monkeypatch):
-    tree = sample_posterior(DIFFERENCES, **SAMPLING)
-    monkeypatch.setattr(models, "sample_posterior", None)
+def test_predictions_that_a_run_made_are_scored_as_they_are(monkeypatch, tree):
+    monkeypatch.setattr(predictions, "posterior_draws", None)
     predicted, first = np.array([0.5, 0.2, 0.9]), np.array([True, False, True])
     result = calibration(tree, first, predicted=predicted)
     assert float(result["log_score"]) == pytest.approx(np.log(0.5 * 0.8 * 0.9))
@@ -154,10 +165,10 @@ def test_predictions_that_a_run_made_are_scored_as_they_are(monkeypatch):
 def test_rows_of_one_answer_do_not_predict_each_other_and_only_the_pair_asked_about_is_scored():
     rows = np.array([[0.9, -0.4], [0.9, -0.4], [0.9, -0.4], [0.5, 0.8]])
     first, groups = np.array([True, True, False, True]), np.array([0, 0, 0, 4])
-    predicted = prequential_predictions(rows, first, groups=groups, **SAMPLING)
+    predicted = prequential_predictions(rows, first, groups=groups, **FEW)
     np.testing.assert_allclose(predicted[:3], 0.5, atol=1e-12)
-    tree = sample_posterior(rows, **SAMPLING)
-    result = calibration(tree, first, groups=groups, **SAMPLING)
+    tree = sample_posterior(rows, **FEW)
+    result = calibration(tree, first, groups=groups, **FEW)
     np.testing.assert_array_equal(result["predicted"], predicted[2:])
     np.testing.assert_array_equal(result["observed"], [False, True])
 
@@ -169,16 +180,15 @@ def test_answers_of_no_difference_are_used_but_not_scored():
     result = calibration(tree, np.array([True, True, False]), **SAMPLING)
     assert result.sizes["prediction"] == 2
     assert float(result["predicted"][0]) == pytest.approx(0.5, abs=1e-12)
-    without = prequential_predictions(
-        DIFFERENCES[~tied], np.array([True, False]), tie_threshold=0.2, likelihood="logistic", **SAMPLING
-    )
+    model = PreferenceModel(tie_threshold=0.2, likelihood="logistic")
+    without = prequential_predictions(DIFFERENCES[~tied], np.array([True, False]), model, **SAMPLING)
     assert abs(float(result["predicted"][1]) - without[1]) > 0.01
 
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_with_no_answer_or_one_there_is_a_result_of_that_size(number):
-    tree = sample_posterior(DIFFERENCES[:number], **SAMPLING)
-    result = calibration(tree, np.ones(number, dtype=bool), **SAMPLING)
+    tree = sample_posterior(DIFFERENCES[:number], **FEW)
+    result = calibration(tree, np.ones(number, dtype=bool), **FEW)
     assert result.sizes == {"prediction": number, "forecast": number}
     assert float(result["log_score"]) == pytest.approx(number * np.log(0.5))
     axes = Figure().subplots()
@@ -210,7 +220,7 @@ def test_the_figure_is_drawn_on_the_axes_given():
         ),
     ],
 )
-def test_predictions_that_are_none_are_refused(arguments, message):
+def test_invalid_predictions_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         score_predictions(**arguments)
 
@@ -225,7 +235,6 @@ def test_predictions_that_are_none_are_refused(arguments, message):
         ({"groups": np.array([0.0, 1.0, 2.0])}, "groups: expected"),
     ],
 )
-def test_arguments_that_do_not_fit_the_posterior_are_refused(arguments, message):
-    tree = sample_posterior(DIFFERENCES, **SAMPLING)
+def test_arguments_that_do_not_fit_the_posterior_are_refused(tree, arguments, message):
     with pytest.raises(ValueError, match=message):
         calibration(tree, **arguments)

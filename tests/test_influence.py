@@ -4,13 +4,19 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.special import expit
 
-import bayespbrl.models as models
-from bayespbrl.diagnostics import influence, plot_influence
-from bayespbrl.models import sample_posterior
+from bayespbrl.diagnostics import influence, plot_influence, predictions
+from bayespbrl.models import posterior_draws, sample_posterior
 
 SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+FEW = {"num_warmup": 25, "num_samples": 25, "max_samples": 25}  # where any draws will do
 # six answers that agree, and one, the fifth, that contradicts them
 CONTRADICTED = np.array([[0.5, 0.1], [0.4, 0.0], [0.6, -0.1], [0.5, 0.0], [-0.55, 0.05], [0.45, 0.1], [0.5, -0.05]])
+
+
+@pytest.fixture(scope="module")
+def steep():
+    """Eq. 8 at a steepness where its step rules out nearly all draws of one half: few weights count for much."""
+    return sample_posterior(CONTRADICTED, steepness=40.0, **SAMPLING)
 
 
 def test_the_answer_that_contradicts_the_others_is_the_most_influential_and_the_least_probable():
@@ -56,11 +62,9 @@ def test_importance_weights_and_refits_agree_where_k_hat_is_low():
     np.testing.assert_allclose(result["change_estimated"], result["change"], atol=0.08)
 
 
-def test_refits_are_of_the_answers_whose_weights_promise_most():
-    # the step of eq. 8 throws away nearly all draws of one half: many weights are worth little
-    tree = sample_posterior(CONTRADICTED, steepness=40.0, **SAMPLING)
-    assert np.any(influence(tree, refits=0)["pareto_k"] > 0.7)
-    some = influence(tree, refits=3, **SAMPLING)
+def test_refits_are_of_the_answers_with_the_largest_estimated_change(steep):
+    assert np.any(influence(steep, refits=0)["pareto_k"] > 0.7)
+    some = influence(steep, refits=3, **SAMPLING)
     assert some["refitted"].sum() == 3
     estimated, refitted = some["change_estimated"].values, some["refitted"].values
     assert estimated[refitted].min() >= estimated[~refitted].max()
@@ -81,13 +85,13 @@ def test_a_row_of_zeros_has_no_influence():
 def test_the_refits_of_eq_8_keep_the_full_number_of_preferences(monkeypatch):
     asked = []
 
-    def listening(differences, **options):
-        asked.append((len(differences), options["number_of_preferences"], options["seed"], options["prior_scale"]))
-        return sample_posterior(differences, **options)
+    def listening(differences, model, **options):
+        asked.append((len(differences), options["number_of_preferences"], options["seed"], model.prior_scale))
+        return posterior_draws(differences, model, **options)
 
-    tree = sample_posterior(CONTRADICTED[:3], seed=7, prior_scale=0.8, **SAMPLING)
-    monkeypatch.setattr(models, "sample_posterior", listening)
-    influence(tree, refits=2, **SAMPLING)
+    tree = sample_posterior(CONTRADICTED[:3], seed=7, prior_scale=0.8, **FEW)
+    monkeypatch.setattr(predictions, "posterior_draws", listening)
+    influence(tree, refits=2, **FEW)
     assert asked == [(2, 3, 7, 0.8)] * 2
 
 
@@ -101,14 +105,14 @@ def test_without_the_only_answer_the_prior_is_left():
 
 
 def test_without_answers_there_is_none_to_leave_out():
-    result = influence(sample_posterior(np.zeros((0, 2)), **SAMPLING), refits=None)
+    result = influence(sample_posterior(np.zeros((0, 2)), **FEW), refits=None)
     assert result.sizes["preference"] == 0
     axes = Figure().subplots()
     assert plot_influence(result, axes) is axes
 
 
-def test_the_figure_shows_every_answer_and_the_k_hat_of_those_above_the_limit():
-    result = influence(sample_posterior(CONTRADICTED, steepness=40.0, **SAMPLING), refits=2, **SAMPLING)
+def test_the_figure_shows_every_answer_and_the_k_hat_of_those_above_the_limit(steep):
+    result = influence(steep, refits=2, **FEW)
     figure = Figure()
     left, right = figure.subplots(1, 2)
     assert plot_influence(result, right) is right
@@ -121,6 +125,6 @@ def test_the_figure_shows_every_answer_and_the_k_hat_of_those_above_the_limit():
 
 
 def test_a_negative_number_of_refits_is_refused():
-    tree = sample_posterior(CONTRADICTED[:1], **SAMPLING)
-    with pytest.raises(ValueError, match="refits: expected a number >= 0 or None, got -1"):
+    tree = sample_posterior(CONTRADICTED[:1], **FEW)
+    with pytest.raises(ValueError, match="refits: expected a whole number >= 0, got -1"):
         influence(tree, refits=-1)

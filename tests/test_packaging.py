@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 LINKS = ("models", "diagnostics", "envs")
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "bayespbrl").rglob("*.py")}
-TEMPLATES = {f"bayespbrl/diagnostics/report.{form}.jinja" for form in ("html", "md")}
+TEMPLATES = {f"bayespbrl/diagnostics/report/templates/report.{form}.jinja" for form in ("html", "md")}
 
 
 @pytest.fixture(scope="module")

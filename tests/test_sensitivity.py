@@ -12,6 +12,12 @@ SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
 DIFFERENCES = np.array([[0.9, -0.4, 0.0], [0.5, 0.8, 0.0], [0.0, 0.0, 0.0]])
 
 
+@pytest.fixture(scope="module")
+def tree():
+    """The posterior of eq. 8 given all differences."""
+    return sample_posterior(DIFFERENCES, **SAMPLING)
+
+
 def of_component(result, component):
     return result["sensitivity"].sel(component=component).values
 
@@ -28,17 +34,16 @@ def sensitivity_of_a_normal(low, high, alpha=1.01):
     return np.sqrt(divergence / (np.sum(p + q) * step)) / np.log2(alpha)
 
 
-def test_utility_that_no_answer_has_seen_depends_on_the_prior_scale_alone():
-    tree = sample_posterior(DIFFERENCES, **SAMPLING)
+def test_utility_that_no_answer_constrains_depends_on_the_prior_scale_alone(tree):
     result = sensitivity(tree, np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.001]]))
     assert np.all(of_component(result, "prior") > 0.06)
     assert np.all(of_component(result, "likelihood") < 0.03)
     assert list(result["diagnosis"].values) == ["prior", "prior"]
-    # the unit of a utility is nobody's business
+    # the unit of a utility does not matter
     np.testing.assert_allclose(*of_component(result, "prior"), rtol=1e-9)
 
 
-def test_answers_that_say_nothing_have_no_weight():
+def test_the_posterior_is_insensitive_to_answers_without_information():
     tree = sample_posterior(DIFFERENCES, likelihood="logistic", steepness=1e-4, **SAMPLING)
     result = sensitivity(tree)
     assert np.all(of_component(result, "likelihood") < 0.01)
@@ -46,13 +51,13 @@ def test_answers_that_say_nothing_have_no_weight():
 
 
 @pytest.mark.parametrize("steepness", [1e-14, 1e-8])
-def test_answers_as_likely_under_every_draw_but_for_rounding_have_no_weight(steepness):
+def test_the_posterior_is_insensitive_to_answers_equally_likely_but_for_rounding(steepness):
     tree = sample_posterior(DIFFERENCES, steepness=steepness, likelihood="logistic", **SAMPLING)
     assert np.ptp(tree["log_likelihood"]["answers"].values) > 0
     np.testing.assert_array_equal(of_component(sensitivity(tree), "likelihood"), 0)
 
 
-def test_answers_that_fix_a_utility_take_the_weight_from_the_prior():
+def test_answers_that_determine_a_utility_reduce_the_sensitivity_to_the_prior():
     # six answers against two of the same pair: at steepness 20 the utility is known to a tenth of its prior spread
     rows = np.array([[0.4, 0.1]] * 6 + [[-0.4, -0.1]] * 2)
     vague, sharp = (
@@ -69,8 +74,8 @@ def test_features_that_are_the_differences_have_the_sensitivity_of_the_margins()
     np.testing.assert_allclose(utilities["sensitivity"], margins["sensitivity"], rtol=1e-6)
 
 
-def test_a_row_of_zeros_is_insensitive():
-    result = sensitivity(sample_posterior(DIFFERENCES, **SAMPLING))
+def test_a_row_of_zeros_is_insensitive(tree):
+    result = sensitivity(tree)
     np.testing.assert_array_equal(result["sensitivity"][:, 2], 0)
     assert result["diagnosis"].values[2] == "neither"
     assert np.all(result["sensitivity"][:, :2] > 0)
@@ -106,10 +111,10 @@ def test_with_no_answer_or_one_there_is_a_result_of_that_size(number):
     assert plot_sensitivity(result, axes) is axes
 
 
-def test_the_figure_has_two_bars_a_quantity_on_the_axes_given():
+def test_the_figure_has_two_bars_a_quantity_on_the_axes_given(tree):
     figure = Figure()
     left, right = figure.subplots(1, 2)
-    result = sensitivity(sample_posterior(DIFFERENCES, **SAMPLING))
+    result = sensitivity(tree)
     assert plot_sensitivity(result, right) is right
     FigureCanvasAgg(figure).draw()
     assert not left.has_data()
@@ -118,7 +123,6 @@ def test_the_figure_has_two_bars_a_quantity_on_the_axes_given():
 
 
 @pytest.mark.parametrize("features", [np.zeros(3), np.zeros((2, 2)), np.array([[np.inf, 0.0, 0.0]])])
-def test_features_that_do_not_fit_are_refused(features):
-    tree = sample_posterior(DIFFERENCES, **SAMPLING)
+def test_features_that_do_not_fit_are_refused(tree, features):
     with pytest.raises(ValueError, match=r"features: expected .* got"):
         sensitivity(tree, features)

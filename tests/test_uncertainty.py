@@ -1,6 +1,7 @@
 """From draws of the weights to returns, rankings, Q and greedy actions: on cases that can be written down."""
 
 import itertools
+from functools import cache
 
 import jax
 import matplotlib.pyplot
@@ -25,8 +26,10 @@ from bayespbrl.diagnostics.uncertainty import (
 )
 from bayespbrl.features import OneHot
 from bayespbrl.improvement.q_function import estimate_q
+from bayespbrl.models import PreferenceModel
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
-from bayespbrl.utility.estimate import estimate_utility
+from bayespbrl.utility.comparisons import Comparisons
+from bayespbrl.utility.inference import estimate_utility
 
 
 def staying(state, steps=4):
@@ -36,8 +39,11 @@ def staying(state, steps=4):
 TRAJECTORIES = [staying(0), staying(1), staying(2)]
 
 
-def fitted(pairs=((2, 1),), method="posterior-mean"):
-    return estimate_utility(TRAJECTORIES, pairs, OneHot(3), method=method, discount=0.9)
+@cache
+def fitted(method="posterior-mean"):
+    """The estimate from one answer, 2 ≻ 1."""
+    comparisons = Comparisons.among(TRAJECTORIES, [(2, 1)], discount=0.9)
+    return estimate_utility(comparisons, OneHot(3), PreferenceModel(), method=method)
 
 
 def given_returns(values):
@@ -91,7 +97,7 @@ def test_a_thinned_estimate_has_the_draws_that_fewer_draws_are():
     sizes = some.posterior["posterior"].sizes
     assert some.posterior["sample_stats"].sizes["draw"] == sizes["draw"] == 40 / sizes["chain"]
     np.testing.assert_array_equal(some.weights, estimate.weights)
-    with pytest.raises(ValueError, match="number: expected at least 1 draw, got 0"):
+    with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
         thinned(estimate, 0)
 
 
@@ -140,7 +146,7 @@ def grid():
 
 
 def test_successor_features_are_the_discounted_visits_to_come_under_the_observed_frequencies(grid):
-    steps, table, discount = transitions(grid.trajectories), grid.policy.table, grid.settings.discount
+    steps, table, discount = transitions(grid.trajectories), grid.policy.table, grid.settings.critic.discount
     counts = np.zeros((125, 25))
     np.add.at(counts, (steps.states * 5 + steps.actions, steps.next_states), 1)
     assert (counts.sum(axis=1) > 0).all()
@@ -186,9 +192,7 @@ def test_q_of_any_weights_is_what_lstd_gives_for_their_utilities():
         key=jax.random.key(2),
         action_space=learner.environment.action_space,
         features=successors.features,
-        discount=learner.settings.discount,
-        fixed_point_ridge=learner.settings.fixed_point_ridge,
-        projection_ridge=learner.settings.projection_ridge,
+        critic=learner.settings.critic,
     )
     expected = alone(steps.states, steps.actions)
     found = successors(steps.states, steps.actions) @ weights
@@ -270,10 +274,10 @@ def test_no_states_or_no_actions_are_refused(states, actions):
         q_draws(fitted(), None, states, actions)
 
 
-def test_no_trajectories_no_draws_and_a_state_that_there_is_not_are_refused():
+def test_no_trajectories_no_draws_and_an_unknown_state_are_refused():
     with pytest.raises(ValueError, match="trajectory_features: expected at least one trajectory"):
         return_draws(fitted(), [])
-    with pytest.raises(ValueError, match="number: expected at least 1 draw, got 0"):
+    with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
         return_draws(fitted(), TRAJECTORIES, number=0)
     with pytest.raises(ValueError, match=r"state: expected a number in 0 … 1, got 2"):
         plot_q(given_q(np.zeros((4, 2, 3))), Figure().subplots(), state=2)

@@ -1,16 +1,17 @@
-"""What a researcher puts before a reviewer: convergence, calibration, sensitivity, influence, comparison, pictures.
+"""Diagnostics of a posterior and of a run: convergence, calibration, sensitivity, influence, comparison, uncertainty.
 
-Each result is an xarray `Dataset`; each figure function draws on the matplotlib axes it is given and returns them.
+Each result is an xarray `Dataset`. Each plot function draws on the matplotlib axes it is given and returns them.
 
-  convergence, chains    R̂, effective sample size, Monte Carlo error, ranks
-  predictions            probabilities of answers, by exact refits
-  prequential            calibration: each answer predicted before it was used
-  comparison             likelihoods against each other, by k-fold refits
-  leave_one_out          which answer carries the posterior
-  power_scaling          sensitivity to the prior scale and to the likelihood
-  uncertainty            draws of returns, rankings, Q and greedy actions
-  plots                  figures of a run
-  report, report_*       the report: evidence read from the run directory, tables, figures, sections, warnings
+  chains          convergence: R̂, effective sample size, Monte Carlo error, rank plots
+  predictions     posterior predictive probabilities of held-out answers, by exact refits
+  prequential     calibration: each answer predicted before it was used
+  comparison      models compared by k-fold cross-validation
+  leave_one_out   influence of each answer on the posterior
+  power_scaling   sensitivity to the prior scale and to the likelihood
+  uncertainty     posterior draws of returns, rankings, Q and greedy actions
+  estimates       what all of these ask of a utility estimate
+  plots           figures of a run and of a study
+  report          the diagnostic report of a run, as one HTML or Markdown file
 """
 
 from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ranks

@@ -1,4 +1,4 @@
-"""Whether a posterior's chains agree: R̂, effective sample sizes and Monte Carlo errors of the margins (step 1)."""
+"""Convergence of a posterior's chains: R̂, effective sample sizes and Monte Carlo errors of the margins (step 1)."""
 
 import numpy as np
 import xarray as xr
@@ -6,15 +6,16 @@ from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from bayespbrl import checks
 from bayespbrl.models.convergence import chain_convergence
 
 
 def convergence(tree: xr.DataTree, *, rhat_max: float = 1.01, effective_sample_size_min: float = 400.0) -> xr.Dataset:
-    """What the draws of each margin are worth.
+    """Convergence diagnostics of each margin.
 
     Args:
       tree: what `sample_posterior` returned.
-      rhat_max, effective_sample_size_min: what every margin has to meet.
+      rhat_max, effective_sample_size_min: limits for every margin.
 
     Returns:
       rhat, effective_sample_size (bulk), effective_sample_size_tail, monte_carlo_error (of the mean), converged, each
@@ -50,7 +51,7 @@ def convergence(tree: xr.DataTree, *, rhat_max: float = 1.01, effective_sample_s
 
 
 def plot_convergence(result: xr.Dataset, axes: Axes) -> Axes:
-    """Effective sample size of each margin; those that have not converged carry their R̂."""
+    """Effective sample size of each margin; R̂ is written beside those that have not converged."""
     numbers = np.arange(result.sizes["preference"])
     axes.plot(numbers, result["effective_sample_size"], "o", markersize=3, label="bulk")
     axes.plot(numbers, result["effective_sample_size_tail"], "x", markersize=4, label="tail")
@@ -72,24 +73,23 @@ def plot_convergence(result: xr.Dataset, axes: Axes) -> Axes:
 
 
 def plot_ranks(tree: xr.DataTree, axes: Axes, *, preference: int | None = None, bins: int = 20) -> Axes:
-    """Ranks of each chain's draws among all of them, as one line a chain: level where the chains agree.
+    """Rank plot: histogram of each chain's ranks among all draws, one line per chain, flat where the chains agree.
 
     Args:
       tree: what `sample_posterior` returned.
       axes: to draw on.
-      preference: whose margin; that of largest R̂ by default.
+      preference: number of the margin; the one with the largest R̂ by default.
       bins: of the ranks.
 
     Raises:
-      ValueError: a preference that there is not.
+      ValueError: an unknown preference.
 
     Source: Vehtari et al. (2021), section 4.2.
     """
     margins = np.asarray(tree["posterior"]["margins"])
     if preference is None and margins.shape[2]:
         preference = int(np.argmax(chain_convergence(margins).rhat))
-    if preference is None or not 0 <= preference < margins.shape[2]:
-        raise ValueError(f"preference: expected a number in 0 … {margins.shape[2] - 1}, got {preference}")
+    preference = checks.index("preference", preference, margins.shape[2])
     draws = margins[:, :, preference]
     ranks = np.argsort(np.argsort(draws, axis=None)).reshape(draws.shape)
     for chain, row in enumerate(ranks):

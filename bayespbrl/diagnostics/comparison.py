@@ -1,92 +1,68 @@
-"""Which likelihood the answers speak for: k-fold cross-validation by exact refits (eq. 8 and its relatives).
+"""Comparison of preference models by k-fold cross-validation with exact refits (eq. 8 and the alternatives to it).
 
-Importance-sampling estimates from one fit fail on a likelihood with a jump; here each answer is predicted by a
-posterior that has not seen it.
+Importance-sampling estimates from one fit fail for a likelihood with a jump. Here each answer is predicted by a
+posterior that was fitted without it.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from bayespbrl.diagnostics.predictions import (
-    PREFERRED,
-    TIED,
-    checked_bool,
-    checked_differences,
-    checked_groups,
-    held_out_probabilities,
-)
+from bayespbrl import checks
+from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_groups, held_out_probabilities
+from bayespbrl.models import PreferenceModel
 
 
 def compare_likelihoods(
     differences: np.ndarray,
-    candidates: Mapping[str, Mapping[str, Any]],
+    candidates: Mapping[str, PreferenceModel],
     *,
     folds: int = 5,
     groups: np.ndarray | None = None,
     indifferent: np.ndarray | None = None,
     seed: int = 0,
-    **sampling_options: Any,
+    **sampling_options: int,
 ) -> xr.Dataset:
-    """Expected log predictive density of the answers under each candidate.
+    """Expected log predictive density (elpd) of the answers under each candidate.
 
     Args:
-      differences: ψ(preferred) − ψ(dominated), shape (K, D).
-      candidates: for each name the options of `sample_posterior` that make the model (likelihood, steepness,
-        lapse_rate, prior_scale, tie_threshold). Eq. 8 keeps the full K.
-      folds: >= 2; answers are dealt to them at random, and as many as there are answers leave out one at a time.
+      differences: ψ(preferred) − ψ(dominated), shape (K, D); eq. 8 keeps the full K.
+      candidates: models by name.
+      folds: >= 2, assigned at random; leave-one-out with as many folds as answers.
       groups: the number of the answer that each row follows from, shape (K,), never decreasing: rows of one answer are
         left out together. Every row is an answer of its own by default.
-      indifferent: which answers were "no difference", shape (K,) bool; then every candidate needs a `tie_threshold`,
-        for without one its probability of such an answer is zero.
+      indifferent: which answers were "no difference", shape (K,) bool. Every candidate then needs a `tie_threshold`.
       seed: of the folds and of the sampler.
       sampling_options: `num_samples` and the like, the same for all candidates.
 
     Returns:
-      `log_probability` (candidate, preference) of each answer given the other folds; by candidate `elpd`, its sum in
-      nats, and `standard_error`; `difference` of elpd to the best and `difference_error` from the answers' differences;
-      `converged`, whether every refit did; `fold` (preference). Best first.
-
-    Raises:
-      ValueError: an argument out of its range, named with what came.
+      `log_probability` (candidate, preference) of each answer given the other folds; `elpd`, its sum in nats, and
+      `standard_error`; `difference` in elpd from the best and `difference_error`; `converged`, whether every refit
+      converged; `fold` (preference). The best candidate comes first.
 
     Source: Vehtari, Gelman & Gabry (2017), section 2.3 and eq. 24.
     """
-    differences = checked_differences(differences)
+    differences = checks.matrix("differences", differences)
     number = len(differences)
-    groups = checked_groups(groups, number)
-    tied = np.zeros(number, dtype=bool) if indifferent is None else checked_bool("indifferent", indifferent, number)
+    fold = _assigned_folds(answer_groups(groups, number), checks.whole("folds", folds, 2), seed=seed)
+    tied = np.zeros(number, dtype=bool) if indifferent is None else checks.flags("indifferent", indifferent, number)
     if not candidates:
         raise ValueError("candidates: expected at least one, got none")
-    lacking = [name for name, options in candidates.items() if tied.any() and options.get("tie_threshold") is None]
+    lacking = [name for name, model in candidates.items() if tied.any() and model.tie_threshold is None]
     if lacking:
-        raise ValueError(
-            f"candidates: expected a tie_threshold in each because some answers are ties, got none in {lacking}"
-        )
-    if not isinstance(folds, int | np.integer) or folds < 2:
-        raise ValueError(f"folds: expected an integer >= 2, got {folds!r}")
-    fold = _dealt(groups, folds, seed=seed)
-    outcome = np.where(tied, TIED, PREFERRED)
-    log_probability = np.zeros((len(candidates), number))
-    converged = np.ones(len(candidates), dtype=bool)
-    for c, options in enumerate(candidates.values()):
-        for held_out in np.unique(fold):
-            asked = fold == held_out
-            probabilities, in_order = held_out_probabilities(
-                differences, ~asked, asked, indifferent=tied, **{"seed": seed, **sampling_options, **options}
-            )
-            chosen = probabilities[np.arange(len(probabilities)), outcome[asked]]
-            with np.errstate(divide="ignore"):  # what a candidate calls impossible costs it everything
-                log_probability[c, asked] = np.log(chosen)
-            converged[c] &= in_order
+        raise ValueError(f"candidates: expected a tie_threshold in each because of the ties, got none in {lacking}")
+    results = [
+        _held_out_log_probability(differences, model, fold, tied, seed=seed, **sampling_options)
+        for model in candidates.values()
+    ]
+    log_probability, converged = (np.array(values) for values in zip(*results, strict=True))
     return _table(list(candidates), log_probability, converged, fold)
 
 
 def plot_comparison(result: xr.Dataset, axes: Axes) -> Axes:
-    """Difference of each candidate's expected log predictive density to the best, with one standard error."""
+    """Difference of each candidate's expected log predictive density from the best, with one standard error."""
     numbers = np.arange(result.sizes["candidate"])
     axes.errorbar(result["difference"], numbers, xerr=result["difference_error"], fmt="o", markersize=4, capsize=2)
     names = [str(name) for name in result["candidate"].values]
@@ -96,12 +72,30 @@ def plot_comparison(result: xr.Dataset, axes: Axes) -> Axes:
     axes.invert_yaxis()
     axes.axvline(0.0, color="0.5", linestyle="--", linewidth=1)
     best = f"best: {float(result['elpd'][0]):.2f} ± {float(result['standard_error'][0]):.2f}"
-    axes.set(xlabel="difference of elpd (nats)", title=best)
+    axes.set(xlabel="difference in elpd (nats)", title=best)
     return axes
 
 
-def _dealt(groups: np.ndarray, folds: int, *, seed: int) -> np.ndarray:
-    """The fold of each row, shape (K,): whole answers, as many in each fold as in any other, give or take one."""
+def _held_out_log_probability(
+    differences: np.ndarray, model: PreferenceModel, fold: np.ndarray, tied: np.ndarray, **sampling_options: int
+) -> tuple[np.ndarray, bool]:
+    """Log probability of each answer given the other folds, shape (K,), and whether every refit converged."""
+    outcome = np.where(tied, TIED, PREFERRED)
+    log_probability, converged = np.zeros(len(fold)), True
+    for held_out in np.unique(fold):
+        asked = fold == held_out
+        probabilities, fit_converged = held_out_probabilities(
+            differences, model, ~asked, asked, indifferent=tied, **sampling_options
+        )
+        chosen = probabilities[np.arange(len(probabilities)), outcome[asked]]
+        with np.errstate(divide="ignore"):  # an answer that the model rules out: log 0
+            log_probability[asked] = np.log(chosen)
+        converged &= fit_converged
+    return log_probability, converged
+
+
+def _assigned_folds(groups: np.ndarray, folds: int, *, seed: int) -> np.ndarray:
+    """The fold of each row, shape (K,): whole answers, in folds whose sizes differ by at most one."""
     labels, place = np.unique(groups, return_inverse=True)
     return np.random.default_rng(seed).permutation(np.arange(len(labels)) % folds)[place]
 
@@ -109,7 +103,7 @@ def _dealt(groups: np.ndarray, folds: int, *, seed: int) -> np.ndarray:
 def _table(names: list[str], log_probability: np.ndarray, converged: np.ndarray, fold: np.ndarray) -> xr.Dataset:
     elpd = log_probability.sum(axis=1)
     order = np.argsort(-elpd, kind="stable")
-    with np.errstate(invalid="ignore"):  # both impossible: neither is better
+    with np.errstate(invalid="ignore"):  # both −∞: neither is better
         behind = log_probability - log_probability[order[0]]
     values = {
         "elpd": elpd,

@@ -2,8 +2,6 @@
 
 from typing import TypeGuard
 
-import numpy as np
-
 from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
 from bayespbrl.models.likelihoods import prob
 from bayespbrl.trajectories import Trajectory, trajectory_features
@@ -22,6 +20,13 @@ def expect_sampled(estimate: UtilityEstimate | None) -> PosteriorUtility:
     return found
 
 
+def expect_estimate(estimate: UtilityEstimate | None) -> UtilityEstimate:
+    """`estimate`; `ValueError` before there is one."""
+    if estimate is None:
+        raise ValueError("estimate: expected a utility estimate, got none yet")
+    return estimate
+
+
 def is_average(estimate: UtilityEstimate | None) -> TypeGuard[AveragedUtility]:
     """Whether the learner acts on an average over settings, of which `sampled` is one."""
     return isinstance(estimate, AveragedUtility)
@@ -38,7 +43,7 @@ def one_setting(
     estimate: PosteriorUtility | LinearProgramUtility | AveragedUtility,
 ) -> PosteriorUtility | LinearProgramUtility:
     """The estimate itself, linear in features of the state, or the sampled setting of an average."""
-    return estimate.sampled if is_average(estimate) else estimate
+    return estimate if isinstance(estimate, LinearProgramUtility) else estimate.sampled
 
 
 def first_preferred_probability(estimate: UtilityEstimate, first: Trajectory, second: Trajectory) -> float:

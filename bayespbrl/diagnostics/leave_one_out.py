@@ -1,10 +1,8 @@
-"""Which answer carries the posterior: what changes when it is left out, by importance weights and by exact refits.
+"""Influence of each answer: how the posterior changes without it, by importance weights and by exact refits.
 
-Pareto-smoothed weights estimate each change from the draws that there are; k̂ says how far they can be trusted (not
-above 0.7, which is common where a likelihood has a jump), and is itself a measure of influence. The refits are exact.
+Pareto-smoothed importance weights estimate each change from the draws at hand. Their k̂ is itself a measure of
+influence; above 0.7, which is common for a likelihood with a jump, the estimate is not reliable. The refits are exact.
 """
-
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,32 +10,29 @@ from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from bayespbrl import checks
 from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_probabilities, refit, tied_rows
 
 PARETO_K_LIMIT = 0.7
 
 
-def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: Any) -> xr.Dataset:
+def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: int) -> xr.Dataset:
     """Change of the posterior when each of the K answers is left out.
 
     Args:
       tree: what `sample_posterior` returned.
-      refits: how many answers are left out by an exact refit, those whose change by importance weights is
-        largest (on real answers the same, nearly, as those whose exact change is; k̂ is not); None for all.
+      refits: number of answers left out by an exact refit: those with the largest change by importance weights, a
+        better predictor of the exact change than k̂. None for all.
       sampling_options: `num_samples` and the like of the refits; eq. 8 keeps the full K.
 
     Returns:
       along `preference`: `pareto_k`; `change_estimated`, the length of the change of the mean utility weights over the
       prior scale, by importance weights; where `refitted`, and NaN elsewhere: `change`, the same by the refit,
       `probability` of the answer given the others, and `margin_means` (preference, margin), the means of all margins
-      without the answer; `converged`, whether the refit did. Beside them `margin_mean` (margin), the means with all.
-
-    Raises:
-      ValueError: refits < 0.
+      without the answer; `converged`, whether the refit converged. Also `margin_mean` (margin), given all answers.
     """
     number = tree["constant_data"].sizes["preference"]
-    if refits is not None and refits < 0:
-        raise ValueError(f"refits: expected a number >= 0 or None, got {refits}")
+    refits = None if refits is None else checks.whole("refits", refits, 0)
     differences = np.asarray(tree["constant_data"]["differences"])
     weights = np.asarray(tree["utility_weights_mean"])
     scale = float(tree.attrs["prior_scale"])
@@ -68,7 +63,7 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
 
 
 def plot_influence(result: xr.Dataset, axes: Axes) -> Axes:
-    """Change of the mean utility weights by each answer, exact where it was refitted; k̂ where above its limit."""
+    """Change of the mean utility weights without each answer, with the exact refits, and k̂ where above its limit."""
     numbers = np.arange(result.sizes["preference"])
     axes.plot(numbers, result["change_estimated"], "o", markersize=4, fillstyle="none", label="by importance weights")
     axes.plot(numbers, result["change"], "o", markersize=4, label="by exact refit")

@@ -1,21 +1,23 @@
-"""Figures of a run. Each function draws on the matplotlib axes it is given and returns them."""
+"""Figures of a run and of a study. Each plot function draws on the matplotlib axes it is given and returns them."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from bayespbrl.diagnostics.estimates import expect_estimate
 from bayespbrl.envs.opening import environment_attribute
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Transitions, transitions
 
 
 def learning_curve(iterations: Sequence[Mapping[str, Any]], axes: Axes, *, optimum: float | None = None) -> Axes:
-    """Value against answers.
+    """Value against number of answers.
 
     Args:
       iterations: summaries of the completed iterations.
@@ -31,12 +33,12 @@ def learning_curve(iterations: Sequence[Mapping[str, Any]], axes: Axes, *, optim
 
 
 def quartile_curve(quartiles: xr.Dataset, axes: Axes, *, levels: Mapping[str, float] | None = None) -> Axes:
-    """Median of the value over trials against answers, with the band between the quartiles.
+    """Median and quartiles of the value over trials, against number of answers.
 
     Args:
-      quartiles: as `Trials.quartiles` gives them: lower_quartile, median and upper_quartile by answers.
+      quartiles: lower_quartile, median and upper_quartile by answers, from `Trials.quartiles`.
       axes: to draw on.
-      levels: horizontal lines by name, of what others have published or of the optimum.
+      levels: horizontal lines by name: published returns, the optimum.
     """
     answers = quartiles["answers"]
     axes.fill_between(
@@ -51,10 +53,9 @@ def quartile_curve(quartiles: xr.Dataset, axes: Axes, *, levels: Mapping[str, fl
     return axes
 
 
-def trials_figure(quartiles: xr.Dataset, environment: Any, title: str) -> Figure:
-    """`quartile_curve` with the levels that the environment knows: its optimum, and returns published by others."""
+def trials_figure(quartiles: xr.Dataset, environment: gymnasium.Env, title: str) -> Figure:
+    """`quartile_curve` with the environment's published returns and its optimum, where it has them."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
     levels = dict(environment_attribute(environment, "published_returns") or {})
     optimum = environment_attribute(environment, "optimal_return")
     axes = quartile_curve(
@@ -65,25 +66,22 @@ def trials_figure(quartiles: xr.Dataset, environment: Any, title: str) -> Figure
 
 
 def utility_beside_reward(learner: Learner, utility_axes: Axes, reward_axes: Axes) -> tuple[Axes, Axes]:
-    """The inferred utility and the hidden reward of the states seen so far.
+    """The inferred utility and the hidden reward of the visited states.
 
-    A grid's cells as two maps; two-dimensional observations as two clouds of points; for any other observations, the
-    utility of each step against its reward, and of each trajectory against its return.
+    Maps for a grid, coloured points for two-dimensional observations. For all other observations: the utility of each
+    step against its reward, and of each trajectory against its return.
     """
     steps = transitions(learner.trajectories)
-    utilities = learner.estimate.step_utilities(steps)
+    utilities = expect_estimate(learner.estimate).step_utilities(steps)
     shape = environment_attribute(learner.environment, "grid_shape")
-    if shape is not None:
-        draw = _map_of_cells
-    elif steps.states.ndim == 2 and steps.states.shape[1] == 2:
-        draw = _cloud
-    else:
+    if shape is None and (steps.states.ndim != 2 or steps.states.shape[1] != 2):
         return _scatter(utilities, steps.rewards, learner, utility_axes, reward_axes)
+    draw = _points if shape is None else partial(_map_of_cells, shape=shape)
     for axes, values, title in (
         (utility_axes, utilities, "Inferred utility"),
         (reward_axes, steps.rewards, "Hidden reward"),
     ):
-        draw(steps, values, axes, shape)
+        draw(steps, values, axes)
         axes.set_title(title)
     return utility_axes, reward_axes
 
@@ -91,15 +89,14 @@ def utility_beside_reward(learner: Learner, utility_axes: Axes, reward_axes: Axe
 def run_figure(learner: Learner) -> Figure:
     """The learning curve, and the inferred utility beside the hidden reward, as one figure."""
     figure = Figure(figsize=(13, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     curve, utility, reward = figure.subplots(1, 3)
     learning_curve(learner.iterations, curve, optimum=environment_attribute(learner.environment, "optimal_return"))
     utility_beside_reward(learner, utility, reward)
     return figure
 
 
-def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, shape: Any) -> None:
-    """Mean value on arrival in each cell; cells never entered stay blank."""
+def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, *, shape: tuple[int, int]) -> None:
+    """Mean value on arrival in each cell; cells that were never entered stay blank."""
     size = shape[0] * shape[1]
     counts = np.bincount(steps.next_states, minlength=size)
     sums = np.bincount(steps.next_states, weights=values, minlength=size)
@@ -110,7 +107,7 @@ def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, shape: Any
     axes.set_yticks(range(shape[0]), [str(i + 1) for i in range(shape[0])])
 
 
-def _cloud(steps: Transitions, values: np.ndarray, axes: Axes, shape: Any) -> None:
+def _points(steps: Transitions, values: np.ndarray, axes: Axes) -> None:
     first, second = steps.next_states.T
     points = axes.scatter(first, second, c=values, s=4, cmap="viridis")
     axes.figure.colorbar(points, ax=axes, shrink=0.8)
@@ -123,6 +120,7 @@ def _scatter(
     step_axes.scatter(rewards, utilities, s=4, alpha=0.3)
     step_axes.set(xlabel="hidden reward", ylabel="inferred utility", title="Steps")
     returns = [trajectory.total_reward for trajectory in learner.trajectories]
-    trajectory_axes.scatter(returns, learner.estimate.trajectory_utilities(learner.trajectories), s=10)
+    utilities = expect_estimate(learner.estimate).trajectory_utilities(learner.trajectories)
+    trajectory_axes.scatter(returns, utilities, s=10)
     trajectory_axes.set(xlabel="hidden return", ylabel="inferred utility", title="Trajectories")
     return step_axes, trajectory_axes

@@ -1,7 +1,7 @@
-"""How much the posterior of a utility leans on the prior scale σ and on the answers: power-scaling sensitivity.
+"""Power-scaling sensitivity of the posterior to the prior scale σ and to the likelihood.
 
-The prior N(0, σ²I) to the power α is, normalised, N(0, σ²I/α): scaling its power is changing σ to σ/√α. The likelihood
-to the power α counts every answer α times.
+The normalised power α of the prior N(0, σ²I) is N(0, σ²I/α), so that power-scaling the prior changes σ to σ/√α. The
+likelihood to the power α counts every answer α times.
 """
 
 import numpy as np
@@ -10,32 +10,31 @@ from arviz_stats import psense
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from bayespbrl.diagnostics.predictions import checked_differences
+from bayespbrl import checks
 from bayespbrl.models.low_rank import low_rank
 
 COMPONENTS = ("prior", "likelihood")
-# Standard deviation of a log density over the draws, in nats, below which the powers near 1 that are tried change
-# nothing worth telling, and ArviZ's estimates of the weights' tail divide by zero.
-NOTHING_TO_WEIGH_BY = 1e-3
+# Least standard deviation of a log density over the draws, in nats. Below it powers near 1 have no visible effect, and
+# ArviZ's estimate of the weights' tail divides by zero.
+LEAST_SPREAD = 1e-3
 
 
 def sensitivity(
     tree: xr.DataTree, features: np.ndarray | None = None, *, threshold: float = 0.05, seed: int = 0
 ) -> xr.Dataset:
-    """Power-scaling sensitivity of the margins, or of the utility at given features, to σ and to the likelihood.
+    """Power-scaling sensitivity of the margins, or of utilities wᵀφ, to σ and to the likelihood.
 
     Args:
       tree: what `sample_posterior` returned.
-      features: of states φ(s) or feature sums ψ(τ) whose utility is asked about, shape (n, D), in the units of the
-        differences. None: the K margins.
-      threshold: above it a quantity counts as sensitive.
-      seed: of the prior draws of what the answers do not see.
+      features: φ(s) of states or feature sums ψ(τ), shape (n, D), in the units of the differences. None: the K margins.
+      threshold: a quantity counts as sensitive from here on.
+      seed: of the prior draws in the directions that no answer constrains.
 
     Returns:
-      `sensitivity` (component, quantity) with components "prior" and "likelihood" (0 for a quantity that is the same in
-      every draw, and where the answers are as likely under each draw, or there are none); `diagnosis` (quantity), by
-      which of the two reach the threshold: "both" (prior and answers disagree, or the answers only bound what the prior
-      spreads), "prior", "likelihood" or "neither"; and the attribute `threshold`.
+      `sensitivity` (component, quantity) with components "prior" and "likelihood", 0 for a quantity that is the same in
+      every draw and, of the likelihood, where the answers are equally likely under all draws or there are none;
+      `diagnosis` (quantity), the components that reach the threshold: "both" (prior and answers disagree, or the
+      answers only bound the prior's spread), "prior", "likelihood" or "neither"; and the attribute `threshold`.
 
     Raises:
       ValueError: features of another shape or not finite.
@@ -49,7 +48,7 @@ def sensitivity(
     sensitivities = np.zeros((2, draws.shape[2]))
     groups = {"posterior": (("chain", "draw", "quantity"), draws[:, :, varies])}
     for row, (name, log_density) in enumerate(zip(COMPONENTS, (log_prior, log_likelihood), strict=True)):
-        if not varies.any() or np.std(log_density) < NOTHING_TO_WEIGH_BY:
+        if not varies.any() or np.std(log_density) < LEAST_SPREAD:
             continue
         group = {f"log_{name}": (("chain", "draw"), log_density)}
         parts = {key: xr.Dataset({"utility": value}, labels) for key, value in {**groups, **group}.items()}
@@ -78,17 +77,17 @@ def plot_sensitivity(result: xr.Dataset, axes: Axes) -> Axes:
 
 
 def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draws (chain, draw, n) and the log prior of all that they depend on (chain, draw), up to a constant."""
+    """Draws (chain, draw, n), and the log prior (chain, draw) of the coordinates they depend on, up to a constant."""
     z = np.asarray(tree["posterior"]["coordinates"])
     scale = float(tree.attrs["prior_scale"])
     log_prior = -np.sum(z**2, axis=2) / (2 * scale**2)
     if features is None:
         return np.asarray(tree["posterior"]["margins"]), log_prior
     known = np.asarray(tree["constant_data"]["differences"])
-    features = checked_differences(features, name="features", length=known.shape[1])
+    features = checks.matrix("features", features, columns=known.shape[1])
     basis = low_rank(known).basis
     inside = features @ basis
-    # of the directions that no answer has seen, only those in which the features lie: all D would swamp the weights
+    # of the directions without any answer only those of the features: all D would dominate the importance weights
     rest = features - inside @ basis.T
     rounding = np.linalg.norm(rest, axis=1) <= 1e-9 * np.linalg.norm(features, axis=1)
     outside = low_rank(np.where(rounding[:, None], 0.0, rest))

@@ -1,34 +1,33 @@
-"""What a posterior predicts for comparisons that it was not told the answers of, by exact refits (eqs. 7-8).
+"""Posterior predictive probabilities of answers that the posterior was not fitted to, by exact refits (eqs. 7-8).
 
-Eq. 8 depends on the number of preferences K. Decision: K stays that of all answers however few a refit uses, so that
-all refits belong to one model: the log probabilities of the answers, each given those before it, sum to its evidence.
+Eq. 8 depends on the number of preferences K. Decision: each refit keeps the K of all answers. All refits then belong to
+one model: the log probabilities of the answers, each given those before it, sum to its log marginal likelihood.
 """
 
-from inspect import signature
-from typing import Any
+from dataclasses import fields, replace
 
 import numpy as np
 import xarray as xr
 from scipy.special import ndtr
 
-# the package and not its function: `models` imports `diagnostics.convergence`, and may be half loaded at this line
-from bayespbrl import models
-from bayespbrl.models.likelihoods import ProbitMixture, preference_likelihood
+from bayespbrl import checks
+from bayespbrl.models import PreferenceModel, posterior_draws
+from bayespbrl.models.likelihoods import ProbitMixture
 from bayespbrl.models.low_rank import low_rank
+from bayespbrl.models.posterior import SamplerOptions
 
 PREFERRED, DOMINATED, TIED = 0, 1, 2
-_MODEL_OPTIONS = ("prior_scale", "steepness", "lapse_rate", "likelihood", "tie_threshold")
 
 
 def answer_probabilities(tree: xr.DataTree, differences: np.ndarray) -> np.ndarray:
     """Probability of each possible answer to comparisons that the posterior was not fitted to.
 
-    The part of a difference outside those that were fitted is integrated exactly (its utility has the prior's normal
-    distribution); only the part inside is averaged over draws.
+    Only the part of a difference in the span of the fitted ones is averaged over draws. The utility of the rest has the
+    prior's normal distribution and is integrated exactly.
 
     Args:
       tree: what `sample_posterior` returned.
-      differences: ψ(one) − ψ(other) of n comparisons, in the units of the differences that were fitted, shape (n, D).
+      differences: ψ(one) − ψ(other) of n comparisons, in the units of the fitted differences, shape (n, D).
 
     Returns:
       shape (n, 3): the one is preferred, the other is preferred, no difference (0 without a tie threshold).
@@ -37,98 +36,71 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray) -> np.ndarr
       ValueError: differences of another shape or not finite.
     """
     known = np.asarray(tree["constant_data"]["differences"])
-    differences = checked_differences(differences, length=known.shape[1])
+    differences = checks.matrix("differences", differences, columns=known.shape[1])
     z = np.asarray(tree["posterior"]["coordinates"])
     draws = z.reshape(z.shape[0] * z.shape[1], z.shape[2])
-    return _probabilities(draws, low_rank(known).basis, differences, **model_options(tree))
+    return _probabilities(draws, low_rank(known).basis, differences, fitted_model(tree), number_of_preferences(tree))
 
 
 def held_out_probabilities(
     differences: np.ndarray,
+    model: PreferenceModel,
     used: np.ndarray,
     asked: np.ndarray,
     *,
     indifferent: np.ndarray | None = None,
     number_of_preferences: int | None = None,
-    **options: Any,
+    **sampling_options: int,
 ) -> tuple[np.ndarray, bool]:
-    """Fit to some rows of `differences`, predict others.
+    """Fit a model to some rows of `differences` and predict the answers of others.
 
     Args:
       differences: shape (K, D).
-      used, asked: which rows are fitted, and which n are predicted: bool (K,), or row numbers.
-      indifferent: which rows are answered "no difference", shape (K,) bool.
+      model: prior and likelihood.
+      used, asked: the fitted rows and the n predicted ones: bool (K,), or row numbers.
+      indifferent: rows with the answer "no difference", shape (K,) bool.
       number_of_preferences: K of eq. 8; all rows by default.
-      options: of `sample_posterior`.
+      sampling_options: `seed`, `num_samples` and the like of `sample_posterior`.
 
     Returns:
       `answer_probabilities` (n, 3) of the asked rows, and whether the sampler converged.
     """
-    options = {
-        **options,
-        "number_of_preferences": len(differences) if number_of_preferences is None else number_of_preferences,
-    }
-    known = differences[used]
+    known, number = differences[used], len(differences) if number_of_preferences is None else number_of_preferences
     if len(known) == 0:  # the prior: no draws are needed
-        defaults = signature(models.sample_posterior).parameters
-        model = {name: options.get(name, defaults[name].default) for name in _MODEL_OPTIONS}
-        number = options["number_of_preferences"]
         nothing = np.zeros((1, 0)), np.zeros((differences.shape[1], 0))
-        return _probabilities(*nothing, differences[asked], **model, number_of_preferences=number), True
-    if indifferent is not None and options.get("tie_threshold") is not None:
-        options["indifferent"] = indifferent[used]
-    tree = models.sample_posterior(known, **options)
+        return _probabilities(*nothing, differences[asked], model, number), True
+    tree = _fit(known, model, None if indifferent is None else indifferent[used], number, **sampling_options)
     return answer_probabilities(tree, differences[asked]), bool(tree.attrs["converged"])
 
 
-def refit(tree: xr.DataTree, used: np.ndarray, **sampling_options: Any) -> xr.DataTree:
+def refit(tree: xr.DataTree, used: np.ndarray, **sampling_options: int) -> xr.DataTree:
     """The posterior of the same model given only the answers `used`, shape (K,) bool; eq. 8 keeps its K.
 
-    `sampling_options` are `num_samples` and the like of `sample_posterior`; the seed is the tree's by default.
+    `sampling_options` are `seed`, `num_samples` and the like of `sample_posterior`; the seed is the tree's by default.
     """
-    options = {"seed": int(tree.attrs["seed"]), **model_options(tree), **sampling_options}
-    if options["tie_threshold"] is not None:
-        options["indifferent"] = tied_rows(tree)[used]
-    return models.sample_posterior(np.asarray(tree["constant_data"]["differences"])[used], **options)
+    known = np.asarray(tree["constant_data"]["differences"])[used]
+    options = {"seed": int(tree.attrs["seed"]), **sampling_options}
+    return _fit(known, fitted_model(tree), tied_rows(tree)[used], number_of_preferences(tree), **options)
 
 
-def model_options(tree: xr.DataTree) -> dict[str, Any]:
-    """The options of `sample_posterior` that say which model a tree's draws are from."""
-    threshold = float(tree.attrs["tie_threshold"])
-    options = {name: tree.attrs[name] for name in _MODEL_OPTIONS}
-    return {
-        **options,
-        "tie_threshold": None if np.isnan(threshold) else threshold,
-        "number_of_preferences": int(  # trees of the first releases had no such attribute
-            tree.attrs.get("number_of_preferences", tree["constant_data"].sizes["preference"])
-        ),
-    }
+def fitted_model(tree: xr.DataTree) -> PreferenceModel:
+    """The model that a tree's draws are from."""
+    options = {field.name: tree.attrs[field.name] for field in fields(PreferenceModel)}
+    no_ties = np.isnan(options["tie_threshold"])
+    return PreferenceModel(**options | ({"tie_threshold": None} if no_ties else {}))
+
+
+def number_of_preferences(tree: xr.DataTree) -> int:
+    """K of eq. 8 in a tree's model."""
+    return int(tree.attrs["number_of_preferences"])
 
 
 def tied_rows(tree: xr.DataTree) -> np.ndarray:
-    """Which answers were "no difference", shape (K,) bool."""
+    """Rows with the answer "no difference", shape (K,) bool."""
     return np.asarray(tree["observed_data"]["answers"]) == 0
 
 
-def checked_differences(differences: np.ndarray, *, name: str = "differences", length: int | None = None) -> np.ndarray:
-    """As float64; raises `ValueError` unless it is a finite matrix (K, D), with D = `length` where that is given."""
-    differences = np.asarray(differences, dtype=np.float64)
-    if differences.ndim != 2 or length not in (None, differences.shape[1]):
-        raise ValueError(f"{name}: expected shape (n, {length or 'D'}), got {differences.shape}")
-    if not np.all(np.isfinite(differences)):
-        raise ValueError(f"{name}: expected finite entries, got {np.sum(~np.isfinite(differences))} that are not")
-    return differences
-
-
-def checked_bool(name: str, values: np.ndarray, number: int) -> np.ndarray:
-    """Raises `ValueError` unless it is bool of shape (number,)."""
-    values = np.asarray(values)
-    if values.shape != (number,) or values.dtype != bool:
-        raise ValueError(f"{name}: expected bool of shape ({number},), got {values.dtype} of shape {values.shape}")
-    return values
-
-
-def checked_groups(groups: np.ndarray | None, number: int) -> np.ndarray:
+def answer_groups(groups: np.ndarray | None, number: int) -> np.ndarray:
     """The number of the answer that each of K rows follows from, shape (K,): 0 … K−1 by default.
 
     Raises:
@@ -142,27 +114,28 @@ def checked_groups(groups: np.ndarray | None, number: int) -> np.ndarray:
     return groups
 
 
+def _fit(
+    known: np.ndarray, model: PreferenceModel, tied: np.ndarray | None, number: int, *, seed: int = 0, **sampler: int
+) -> xr.DataTree:
+    tied = None if model.tie_threshold is None else tied
+    options = SamplerOptions(**sampler)
+    return posterior_draws(known, model, seed=seed, indifferent=tied, number_of_preferences=number, sampler=options)
+
+
 def _probabilities(
-    coordinates: np.ndarray,
-    basis: np.ndarray,
-    differences: np.ndarray,
-    *,
-    prior_scale: float,
-    tie_threshold: float | None,
-    likelihood: str,
-    **options: Any,
+    coordinates: np.ndarray, basis: np.ndarray, differences: np.ndarray, model: PreferenceModel, number: int
 ) -> np.ndarray:
-    mixture = preference_likelihood(likelihood, **options).probit_mixture()
+    mixture = replace(model, tie_threshold=None).answer_likelihood(number).probit_mixture()
     inside = differences @ basis
-    # the margin given z is normal: mean z·inside, and the prior's spread along what no answer has seen
-    spread = prior_scale * np.linalg.norm(differences - inside @ basis.T, axis=1)
-    shift = 0.0 if tie_threshold is None else tie_threshold
+    # the margin given z is normal: mean z·inside, and the prior's spread in the directions outside the basis
+    spread = model.prior_scale * np.linalg.norm(differences - inside @ basis.T, axis=1)
+    shift = 0.0 if model.tie_threshold is None else model.tie_threshold
     probabilities = np.empty((len(differences), 3))
     for k, (row, sd) in enumerate(zip(inside, spread, strict=True)):
         margins = coordinates @ row
         probabilities[k, PREFERRED] = np.mean(_smoothed(mixture, margins - shift, sd))
         probabilities[k, DOMINATED] = np.mean(_smoothed(mixture, -margins - shift, sd))
-    probabilities[:, TIED] = 0.0 if tie_threshold is None else 1 - probabilities[:, :TIED].sum(axis=1)
+    probabilities[:, TIED] = 0.0 if model.tie_threshold is None else 1 - probabilities[:, :TIED].sum(axis=1)
     return probabilities
 
 

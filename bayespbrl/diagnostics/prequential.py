@@ -1,9 +1,7 @@
-"""Are the predicted preferences calibrated? Each answer predicted before it was used, scored, and a reliability curve.
+"""Calibration of predicted preferences: each answer is predicted before it is used (prequentially) and scored.
 
-Predicted is that the *first shown* is preferred: of the preferred one it would always turn out true.
+The predicted event is that the trajectory *shown first* is preferred. Its outcome varies, as calibration needs.
 """
-
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,57 +9,58 @@ from matplotlib.axes import Axes
 from scipy.optimize import isotonic_regression
 from scipy.special import xlog1py, xlogy
 
+from bayespbrl import checks
 from bayespbrl.diagnostics.predictions import (
     DOMINATED,
     PREFERRED,
-    checked_bool,
-    checked_differences,
-    checked_groups,
+    answer_groups,
+    fitted_model,
     held_out_probabilities,
-    model_options,
+    number_of_preferences,
     tied_rows,
 )
+from bayespbrl.models import PreferenceModel
 
 
 def prequential_predictions(
     differences: np.ndarray,
     first_preferred: np.ndarray,
+    model: PreferenceModel | None = None,
     *,
     groups: np.ndarray | None = None,
     indifferent: np.ndarray | None = None,
-    **posterior_options: Any,
+    **sampling_options: int,
 ) -> np.ndarray:
     """Probability that the first shown is preferred, for each answer by an exact refit to the answers before it.
 
-    Decision: eq. 8 keeps the K of all answers (see `predictions`), so that the log score is the model's log evidence.
-    `number_of_preferences` among the options sets another.
+    Decision: eq. 8 keeps the K of all answers (see `predictions`), so that the log score is the model's log marginal
+    likelihood.
 
     Args:
       differences: ψ(preferred) − ψ(dominated) in the order of the answers, shape (K, D).
       first_preferred: whether the preferred one was shown first, shape (K,) bool.
+      model: prior and likelihood; the defaults of `PreferenceModel` when None.
       groups: the number of the answer that each row follows from, never decreasing, shape (K,): no row is used to
         predict another of its answer. Every row is an answer of its own by default.
-      indifferent: which rows were answered "no difference", shape (K,) bool. The prediction is conditional on a
-        preference being stated.
-      posterior_options: of `sample_posterior`.
+      indifferent: rows with the answer "no difference", shape (K,) bool. The prediction is conditional on a preference
+        being stated.
+      sampling_options: `seed`, `num_samples` and the like of `sample_posterior`; `number_of_preferences`, another K.
 
     Returns:
       shape (K,).
-
-    Raises:
-      ValueError: an argument of another shape, named with what came.
     """
-    differences = checked_differences(differences)
+    differences = checks.matrix("differences", differences)
     number = len(differences)
-    first_preferred = checked_bool("first_preferred", first_preferred, number)
-    groups = checked_groups(groups, number)
+    first_preferred = checks.flags("first_preferred", first_preferred, number)
+    groups = answer_groups(groups, number)
     if indifferent is not None:
-        indifferent = checked_bool("indifferent", indifferent, number)
+        indifferent = checks.flags("indifferent", indifferent, number)
+    model = PreferenceModel() if model is None else model
     predicted = np.empty(number)
     for group in np.unique(groups):
         asked = groups == group
         probabilities, _ = held_out_probabilities(
-            differences, groups < group, asked, indifferent=indifferent, **posterior_options
+            differences, model, groups < group, asked, indifferent=indifferent, **sampling_options
         )
         stated = probabilities[:, PREFERRED] + probabilities[:, DOMINATED]
         column = np.where(first_preferred[asked], PREFERRED, DOMINATED)
@@ -76,34 +75,37 @@ def calibration(
     predicted: np.ndarray | None = None,
     groups: np.ndarray | None = None,
     seed: int = 0,
-    **sampling_options: Any,
+    **sampling_options: int,
 ) -> xr.Dataset:
-    """Calibration of the predictions that a posterior's model made of its answers, each before it was used.
+    """Calibration of a model's predictions of its answers, each made before the answer was used.
 
     Args:
       tree: what `sample_posterior` returned for all K answers, in their order.
       first_preferred: whether the preferred one was shown first, shape (K,) bool. None: drawn by a fair coin from
-        `seed` (the scores do not depend on it, the reliability curve does), and the attribute `order` says "drawn".
-      predicted: probabilities that the first shown is preferred, shape (K,), as a run recorded them from the posterior
-        it had at the time. None: by exact refits, K − 1 of them.
-      groups: the number of the answer that each row follows from, shape (K,), never decreasing; the pair that was asked
-        about is the last of its rows, and the only one scored.
+        `seed`, and the attribute `order` is "drawn". Only the reliability curve depends on it, not the scores.
+      predicted: probabilities that the first shown is preferred, shape (K,), as recorded during a run. None: by exact
+        refits, K − 1 of them.
+      groups: the number of the answer that each row follows from, shape (K,), never decreasing. The pair that was asked
+        about is the last row of its answer; only that row is scored.
       seed: of drawn orders and of the curve's band.
       sampling_options: `num_samples` and the like of the refits.
 
     Returns:
-      what `score_predictions` returns; answers of "no difference" are not scored.
+      what `score_predictions` returns; answers "no difference" are not scored.
     """
     differences = np.asarray(tree["constant_data"]["differences"])
     number, tied = len(differences), tied_rows(tree)
     order = "drawn" if first_preferred is None else "given"
     if first_preferred is None:
         first_preferred = np.random.default_rng(seed).random(number) < 0.5
-    first_preferred = checked_bool("first_preferred", first_preferred, number)
-    groups = checked_groups(groups, number)
+    first_preferred = checks.flags("first_preferred", first_preferred, number)
+    groups = answer_groups(groups, number)
     if predicted is None:
-        options = {"seed": int(tree.attrs["seed"]), **model_options(tree), **sampling_options}
-        predicted = prequential_predictions(differences, first_preferred, groups=groups, indifferent=tied, **options)
+        options = {"seed": int(tree.attrs["seed"]), "number_of_preferences": number_of_preferences(tree)}
+        options |= sampling_options
+        predicted = prequential_predictions(
+            differences, first_preferred, fitted_model(tree), groups=groups, indifferent=tied, **options
+        )
     predicted = np.asarray(predicted, dtype=np.float64)
     if predicted.shape != (number,):
         raise ValueError(f"predicted: expected shape ({number},), got {predicted.shape}")
@@ -118,26 +120,25 @@ def score_predictions(
 
     Args:
       predicted: in [0, 1], shape (n,).
-      observed: whether it came true, shape (n,) bool.
-      level: of the band in which the curve of calibrated predictions lies, at each forecast by itself.
-      simulations: sets of answers drawn from the predictions, for the band.
-      seed: of these.
+      observed: whether the event happened, shape (n,) bool.
+      level: coverage of the pointwise band for the curve of calibrated predictions.
+      simulations: number of sets of answers drawn from the predictions, for the band.
+      seed: of the simulations.
 
     Returns:
       `predicted`, `observed` (prediction); along `forecast`, the distinct predictions in order: `frequency`, the
-      isotonic regression of what came true (pool-adjacent-violators), `band_lower`, `band_upper`; and the numbers
-      `log_score` (log probability of what came true, nats, summed, 0 is best) and `brier_score` (mean square, 0 is
-      best), each with what it would be on average, `…_expected`, and its standard deviation, `…_sd`, if each
-      prediction were the truth;
+      isotonic regression of the outcomes (pool-adjacent-violators), `band_lower`, `band_upper`; and the numbers
+      `log_score` (summed log probability of the outcomes, nats, 0 is best) and `brier_score` (mean squared error, 0 is
+      best), each with its expectation `…_expected` and standard deviation `…_sd` under the predictions themselves;
       `miscalibration`, `discrimination`, `uncertainty`: brier_score = miscalibration − discrimination + uncertainty.
       Means over no predictions are NaN.
 
     Source: Dimitriadis, Gneiting & Jordan (2021), the curve of `arviz_plots.plot_ppc_pava`.
     """
-    predicted, observed = np.asarray(predicted, dtype=np.float64), np.asarray(observed)
+    predicted = np.asarray(predicted, dtype=np.float64)
     if predicted.ndim != 1 or not np.all((predicted >= 0) & (predicted <= 1)):
         raise ValueError(f"predicted: expected probabilities of shape (n,), got {predicted}")
-    observed = checked_bool("observed", observed, len(predicted))
+    observed = checks.flags("observed", observed, len(predicted))
     if not 0 < level < 1:
         raise ValueError(f"level: expected a number in (0, 1), got {level}")
     forecasts, place, counts = np.unique(predicted, return_inverse=True, return_counts=True)
@@ -160,7 +161,7 @@ def score_predictions(
 
 
 def plot_calibration(result: xr.Dataset, axes: Axes) -> Axes:
-    """The reliability curve with the band of calibrated predictions, the predictions as ticks above and below."""
+    """Reliability curve with the band of calibrated predictions; ticks: predictions, at the top if they came true."""
     axes.plot([0, 1], [0, 1], color="0.5", linestyle="--", linewidth=1)
     label = f"{result.attrs['level']:.0%} band if calibrated"
     axes.fill_between(
@@ -174,7 +175,7 @@ def plot_calibration(result: xr.Dataset, axes: Axes) -> Axes:
     scores = f"log score {float(result['log_score']):.2f}, Brier {float(result['brier_score']):.3f}, {number} answers"
     axes.set(
         xlabel="predicted probability that the first shown is preferred",
-        ylabel="how often it was",
+        ylabel="observed frequency",
         xlim=(0, 1),
         ylim=(-0.03, 1.03),
         title=scores,
@@ -184,7 +185,7 @@ def plot_calibration(result: xr.Dataset, axes: Axes) -> Axes:
 
 
 def _isotonic(observed: np.ndarray, place: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Isotonic frequencies at the distinct forecasts: equal forecasts are one point, in whatever order they come."""
+    """Isotonic frequencies at the distinct forecasts; equal forecasts are one point."""
     if len(counts) == 0:
         return np.zeros(0)
     means = np.bincount(place, weights=observed, minlength=len(counts)) / counts
@@ -194,17 +195,11 @@ def _isotonic(observed: np.ndarray, place: np.ndarray, counts: np.ndarray) -> np
 def _scores(predicted: np.ndarray, observed: np.ndarray, recalibrated: np.ndarray) -> dict[str, float]:
     number = len(predicted)
     if number == 0:
-        named = (
-            "brier_score",
-            "brier_score_expected",
-            "brier_score_sd",
-            "miscalibration",
-            "discrimination",
-            "uncertainty",
-        )
-        return dict.fromkeys(("log_score", "log_score_expected", "log_score_sd"), 0.0) | dict.fromkeys(named, np.nan)
+        sums, brier = ("log_score", "log_score_expected", "log_score_sd"), ("", "_expected", "_sd")
+        means = (*(f"brier_score{end}" for end in brier), "miscalibration", "discrimination", "uncertainty")
+        return dict.fromkeys(sums, 0.0) | dict.fromkeys(means, np.nan)
     variance = predicted * (1 - predicted)
-    # a sure prediction has no spread, and log odds that are infinite
+    # a prediction of 0 or 1 has infinite log odds and adds no variance
     log_odds = np.log(predicted, where=variance > 0, out=np.zeros(number))
     log_odds -= np.log1p(-predicted, where=variance > 0, out=np.zeros(number))
     brier = np.mean((predicted - observed) ** 2)

@@ -1,39 +1,43 @@
-"""The posterior over what matters: returns of trajectories, their ranking, Q and the greedy action (steps 1 and 2).
+"""Posterior draws of returns of trajectories, their ranking, Q and the greedy action (steps 1 and 2).
 
-All of these are linear in the weights: the return of a trajectory is wᵀψ(τ), and because LSTD is linear in the
-utilities, Q(s, a) = wᵀψ(s, a) with the successor features ψ(s, a), which one solution gives for every draw of w.
+All of these are linear in the weights. The return of a trajectory is wᵀψ(τ). LSTD is linear in the utilities, so that
+Q(s, a) = wᵀψ(s, a) with the successor features ψ(s, a), which one solution gives for every draw of w.
 
-Results are in units of the utility, which answers fix up to a positive factor only.
+Results are in units of the utility, which the answers fix only up to a positive factor.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
 from scipy.stats import rankdata
 
+from bayespbrl import checks
+from bayespbrl.diagnostics.estimates import expect_sampled, is_average
 from bayespbrl.improvement.q_function import QFunction, estimate_q
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Trajectory, transitions
-from bayespbrl.utility.averaging import AveragedUtility
+from bayespbrl.utility import PosteriorUtility, UtilityEstimate
 from bayespbrl.utility.posterior_utility import spacing
 
-# Quantiles of the intervals in the figures: half and nine tenths of the draws.
+# Quantiles and line widths of the intervals in the figures, which hold 50 % and 90 % of the draws.
 INTERVALS = ((0.25, 0.75, 4.0), (0.05, 0.95, 1.2))
 
 
-def return_draws(estimate: Any, trajectories: Sequence[Trajectory], *, number: int = 1000) -> xr.Dataset:
-    """Posterior draws of the utility wᵀψ(τ) of each trajectory; an average's as one chain.
+def return_draws(
+    estimate: UtilityEstimate | None, trajectories: Sequence[Trajectory], *, number: int = 1000
+) -> xr.Dataset:
+    """Posterior draws of the utility wᵀψ(τ) of each trajectory; those of an average are one chain.
 
     Args:
-      estimate: a `LinearUtility` with a posterior.
+      estimate: one with a posterior.
       trajectories: n of them, of the run or of any other origin.
-      number: at most so many draws, evenly spaced over the chains.
+      number: cap on the draws, which are evenly spaced over the chains.
 
     Returns:
       `returns` (chain, draw, trajectory), with the attributes converged (0 or 1) and rhat_max of the fit.
@@ -41,20 +45,22 @@ def return_draws(estimate: Any, trajectories: Sequence[Trajectory], *, number: i
     Raises:
       ValueError: an estimate without a posterior; no trajectories; a number < 1.
     """
-    draws = _with_posterior(estimate).trajectory_draws(trajectories, number=number)
-    chains = 1 if isinstance(estimate, AveragedUtility) else estimate.posterior["posterior"].sizes["chain"]
+    fit = expect_sampled(estimate)
+    drawn = estimate if is_average(estimate) else fit
+    draws = drawn.trajectory_draws(trajectories, number=number)
+    chains = 1 if is_average(estimate) else fit.posterior["posterior"].sizes["chain"]
     return xr.Dataset(
         {"returns": (("chain", "draw", "trajectory"), draws.reshape(chains, -1, len(trajectories)))},
         {"trajectory": np.arange(len(trajectories))},
-        _honesty(estimate),
+        _convergence(fit),
     )
 
 
 def ranking_probabilities(returns: xr.Dataset) -> xr.Dataset:
-    """What the posterior says about the order of n trajectories.
+    """Posterior probabilities of the order of n trajectories.
 
     Args:
-      returns: what `return_draws` gave.
+      returns: what `return_draws` returned.
 
     Returns:
       `rank_probability` (trajectory, rank), rank 1 the best; `best_probability` (trajectory); `expected_rank`
@@ -89,11 +95,11 @@ def ranking_probabilities(returns: xr.Dataset) -> xr.Dataset:
 def successor_features(learner: Learner, *, seed: int = 0) -> QFunction:
     """ψ(s, a): the discounted sum of φ that follows action a in s under the learner's policy, for Q(s, a) = wᵀψ(s, a).
 
-    LSTD-Q with every feature of the next state as a utility of its own, from all transitions of the learner; the
-    state-action features are drawn as the learner draws its own.
+    LSTD-Q with each feature of the next state as a utility, from all transitions of the learner. The state-action
+    features are drawn as the learner draws them.
 
     Args:
-      learner: after its first iteration at least; `run.learner` for a run read from disk.
+      learner: after at least one iteration; `run.learner` for a run read from disk.
       seed: of the state-action features and of fresh continuous actions.
 
     Returns:
@@ -104,7 +110,7 @@ def successor_features(learner: Learner, *, seed: int = 0) -> QFunction:
 
     Source: Dayan (1993), "Improving generalization for temporal difference learning: the successor representation".
     """
-    features = _with_posterior(learner.estimate).features
+    features = expect_sampled(learner.estimate).features
     steps = transitions(learner.trajectories)
     return estimate_q(
         learner.policy,
@@ -112,35 +118,42 @@ def successor_features(learner: Learner, *, seed: int = 0) -> QFunction:
         features(steps.next_states),
         key=jax.random.key(seed),
         action_space=learner.environment.action_space,
-        features=learner.state_action_features(steps, rng=np.random.default_rng(seed)),
+        features=learner.feature_source.of_steps(
+            steps, learner.settings.features.of_critic, rng=np.random.default_rng(seed)
+        ),
         critic=learner.settings.critic,
     )
 
 
 def q_draws(
-    estimate: Any, successors: QFunction, states: np.ndarray, actions: np.ndarray, *, number: int = 1000
+    estimate: UtilityEstimate | None,
+    successors: QFunction,
+    states: ArrayLike,
+    actions: ArrayLike,
+    *,
+    number: int = 1000,
 ) -> xr.Dataset:
-    """Posterior draws of Q(s, a) for each of some states and each of some actions.
+    """Posterior draws of Q(s, a) for each pair of the given states and actions.
 
     Args:
-      estimate: a `LinearUtility` with a posterior, of the same features as `successors`.
-      successors: what `successor_features` gave.
+      estimate: one with a posterior, of the same features as `successors`.
+      successors: what `successor_features` returned.
       states: n of them, shape (n, S), or (n,) where discrete.
       actions: m to choose from, shape (m, A), or (m,) where discrete.
-      number: at most so many draws, evenly spaced over the chains.
+      number: cap on the draws, which are evenly spaced over the chains.
 
     Returns:
       `q` (chain, draw, state, action), with the actions as a coordinate where they are numbers, and the attributes of
-      `return_draws`. Of an `AveragedUtility` they are those of the one setting that was sampled, not of the average.
+      `return_draws`. For an average over settings the draws are those of its one sampled setting.
 
     Raises:
       ValueError: an estimate without a posterior; no states or no actions.
     """
-    estimate, states, actions = _with_posterior(estimate), np.asarray(states), np.asarray(actions)
+    fit, states, actions = expect_sampled(estimate), np.asarray(states), np.asarray(actions)
     if states.ndim == 0 or actions.ndim == 0 or not (len(states) and len(actions)):
         raise ValueError(f"states, actions: expected at least one row each, got {states.shape} and {actions.shape}")
     rows = successors(np.repeat(states, len(actions), axis=0), np.concatenate([actions] * len(states)))
-    draws = estimate.draws(rows, number=number)
+    draws = fit.draws(rows, number=number)
     labels = actions.reshape(len(actions), -1)
     return xr.Dataset(
         {"q": (("chain", "draw", "state", "action"), draws.reshape(*draws.shape[:2], len(states), len(actions)))},
@@ -148,20 +161,20 @@ def q_draws(
             "state": np.arange(len(states)),
             "action": labels[:, 0] if labels.shape[1] == 1 else np.arange(len(actions)),
         },
-        _honesty(estimate),
+        _convergence(fit),
     )
 
 
 def greedy_probabilities(q: xr.Dataset) -> xr.Dataset:
-    """What the posterior says about the best action in each state.
+    """Posterior probability that each action is greedy, state by state.
 
     Args:
-      q: what `q_draws` gave.
+      q: what `q_draws` returned.
 
     Returns:
-      `greedy_probability` (state, action), the share of draws in which the action has the highest Q, equal ones
-      sharing; `greedy_of_mean` (state), the action that is greedy to the mean of Q; `expected_loss` (state), the mean
-      over draws of how much less Q that action has than the draw's own best: what certainty would be worth. The
+      `greedy_probability` (state, action), the share of draws in which the action has the highest Q; equal actions
+      share a draw; `greedy_of_mean` (state), the greedy action of the mean of Q; `expected_loss` (state), the mean over
+      draws of the loss in Q of that action against the draw's best (the expected value of perfect information). The
       attributes are those of `q`.
     """
     values = q["q"]
@@ -178,9 +191,9 @@ def greedy_probabilities(q: xr.Dataset) -> xr.Dataset:
 
 
 def plot_returns(returns: xr.Dataset, axes: Axes) -> Axes:
-    """Median, half and nine tenths of the draws of each return less the draw's mean over them, the best on top.
+    """Median, 50 % and 90 % intervals of each return relative to the mean over trajectories, the best on top.
 
-    Answers say nothing about what trajectories of equal length have in common; the prior alone would set that spread.
+    The answers leave open what trajectories of equal length have in common; its spread would be the prior's.
     """
     values = _pooled(returns["returns"])
     values = values - values.mean(axis=1, keepdims=True)
@@ -189,13 +202,15 @@ def plot_returns(returns: xr.Dataset, axes: Axes) -> Axes:
     axes.set_yticks(np.arange(len(order)), [str(label) for label in returns["trajectory"].values[order]])
     axes.axvline(0.0, color="0.5", linestyle="--", linewidth=1)
     axes.set(
-        xlabel="return less its mean (units of the utility)", ylabel="trajectory", title=_titled("Returns", returns)
+        xlabel="return relative to the mean (units of the utility)",
+        ylabel="trajectory",
+        title=_titled("Returns", returns),
     )
     return axes
 
 
 def plot_ranking(ranking: xr.Dataset, axes: Axes) -> Axes:
-    """Probability of each rank as a shade, trajectories by their expected rank, beside the probability to be best."""
+    """Probability of each rank as a shade, by expected rank, with each trajectory's probability to be the best."""
     order = np.argsort(ranking["expected_rank"].values, kind="stable")
     number = len(order)
     table = ranking["rank_probability"].values[order]
@@ -212,18 +227,17 @@ def plot_ranking(ranking: xr.Dataset, axes: Axes) -> Axes:
 
 
 def plot_q(q: xr.Dataset, axes: Axes, *, state: int = 0) -> Axes:
-    """Draws of Q(s, a) − the draw's mean over the actions: what they have in common does not matter to the choice.
+    """Intervals of Q(s, a) relative to the mean over actions, which does not matter to the choice.
 
     Args:
-      q: what `q_draws` gave.
+      q: what `q_draws` returned.
       axes: to draw on.
       state: the number of the state.
 
     Raises:
-      ValueError: a state that there is not.
+      ValueError: an unknown state.
     """
-    if not 0 <= state < q.sizes["state"]:
-        raise ValueError(f"state: expected a number in 0 … {q.sizes['state'] - 1}, got {state}")
+    state = checks.index("state", state, q.sizes["state"])
     values = _pooled(q["q"].isel(state=state))
     values = values - values.mean(axis=1, keepdims=True)
     actions = q["action"].values
@@ -231,13 +245,13 @@ def plot_q(q: xr.Dataset, axes: Axes, *, state: int = 0) -> Axes:
     if not np.issubdtype(actions.dtype, np.floating):
         axes.set_xticks(actions)
     axes.axhline(0.0, color="0.5", linestyle="--", linewidth=1)
-    label = "Q less its mean (units of the utility)"
+    label = "Q relative to the mean (units of the utility)"
     axes.set(xlabel="action", ylabel=label, title=_titled(f"Q in state {state}", q))
     return axes
 
 
 def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
-    """Probability that each action is the best, state by state, as a shade; a dot where it is greedy to the mean."""
+    """Probability that each action is the best, state by state, as a shade; dots: the greedy actions of the mean."""
     table = greedy["greedy_probability"].transpose("state", "action").values
     image = axes.imshow(table, cmap="Blues", vmin=0, vmax=1, aspect="auto")
     axes.figure.colorbar(image, ax=axes, label="probability to be the best action")
@@ -251,29 +265,23 @@ def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
     return axes
 
 
-def thinned(estimate: Any, number: int) -> Any:
+def thinned(estimate: PosteriorUtility, number: int) -> PosteriorUtility:
     """The estimate with at most `number` draws, evenly spaced over the chains, and at least one a chain.
 
     Raises:
-      ValueError: an estimate without a posterior; a number < 1.
+      ValueError: a number < 1.
     """
-    sizes = _with_posterior(estimate).posterior.children["posterior"].sizes
+    sizes = estimate.posterior.children["posterior"].sizes
     apart = spacing(sizes["chain"] * sizes["draw"], number)
     return replace(estimate, posterior=estimate.posterior.isel(draw=slice(None, None, apart)))
 
 
-def _with_posterior(estimate: Any) -> Any:
-    if getattr(estimate, "posterior", None) is None:
-        raise ValueError(f"estimate: expected one with a posterior, got {type(estimate).__name__} without")
-    return estimate
-
-
-def _honesty(estimate: Any) -> dict[str, Any]:
-    return {"converged": int(estimate.quality.converged), "rhat_max": float(estimate.quality.rhat_max)}
+def _convergence(fit: PosteriorUtility) -> dict[str, float]:
+    return {"converged": int(fit.quality.converged), "rhat_max": float(fit.quality.rhat_max)}
 
 
 def _pooled(draws: xr.DataArray) -> np.ndarray:
-    """All chains' draws in one row each: (chain, draw, n) as (S, n)."""
+    """Draws of all chains, (chain, draw, n), as rows (S, n)."""
     values = draws.transpose("chain", "draw", ...).values
     return values.reshape(-1, values.shape[2])
 

@@ -1,111 +1,130 @@
-"""What can be read of a run directory, finished, in progress or broken: the evidence that the report is made of.
+"""What can be read of a run directory, whether the run is finished, in progress or damaged.
 
-A file that cannot be read costs what is in it and nothing more.
+A file that cannot be read costs only its own contents.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import xarray as xr
+from gymnasium.experimental.functional import FuncEnv
 
-from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
-from bayespbrl.diagnostics.report.log import AnswerRecord, read_log
-from bayespbrl.envs.opening import open_environment
-from bayespbrl.features import checked_features
-from bayespbrl.models.likelihoods import prob
+from bayespbrl.diagnostics.estimates import first_preferred_probability, of_states, one_setting, sampled
+from bayespbrl.diagnostics.predictions import fitted_model
+from bayespbrl.diagnostics.report.document import ReportWarning
+from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
+from bayespbrl.envs.opening import environment_attribute, open_environment
+from bayespbrl.features import StateFeatures, checked_features
+from bayespbrl.models import PreferenceModel
 from bayespbrl.preferences import Preferences
 from bayespbrl.runs.directory import RunDirectory
 from bayespbrl.runs.iteration_files import read_parts
-from bayespbrl.settings import WITHOUT_POSTERIOR, Settings
-from bayespbrl.trajectories import Trajectory, trajectory_features
-from bayespbrl.utility.averaging import AveragedUtility
+from bayespbrl.settings import Settings
+from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility import UtilityEstimate
+from bayespbrl.utility.inference import WITHOUT_POSTERIOR
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What a run left behind.
+class RunContents:
+    """The readable contents of a run directory.
 
     Attributes:
       path, settings: of the run.
       iterations: summaries of the completed iterations.
-      answers: in their order, those taken back left out.
-      preferences: what follows from them.
+      answers: in their order, without those taken back.
+      preferences: those that follow from the answers.
       trajectories: by number, those that can be read.
-      estimate: the newest utility estimate that can be read, which is that after iteration `estimate_iteration`; None
-        and 0 without any.
+      estimate: the newest utility estimate that can be read, of iteration `estimate_iteration`; None and 0 without any.
       features_missing: why the estimate's φ, a function of the user's, cannot be used; empty where it can.
       environment: opened; None where it cannot be.
-      waiting: the number of the question that waits for an answer.
-      broken: what could not be read, a sentence each.
+      open_question: number of the question that waits for an answer.
+      damage: one warning for each thing that cannot be read.
     """
 
     path: Path
     settings: Settings
-    iterations: tuple[Mapping[str, Any], ...] = ()
-    answers: tuple[AnswerRecord, ...] = ()
+    iterations: tuple[Summary, ...] = ()
+    answers: tuple[AnsweredQuestion, ...] = ()
     preferences: Preferences = field(default_factory=Preferences)
     trajectories: Mapping[int, Trajectory] = field(default_factory=dict)
-    estimate: Any = None
+    estimate: UtilityEstimate | None = None
     estimate_iteration: int = 0
     features_missing: str = ""
-    environment: Any = None
-    waiting: int | None = None
-    broken: tuple[str, ...] = ()
+    environment: gymnasium.Env | None = None
+    open_question: int | None = None
+    damage: tuple[ReportWarning, ...] = ()
 
     @property
     def finished(self) -> bool:
+        """Whether all iterations are completed."""
         return len(self.iterations) >= self.settings.iterations
 
     @property
     def posterior(self) -> xr.DataTree | None:
-        """Draws of the estimate; None where it is no posterior."""
-        return getattr(self.estimate, "posterior", None)
-
-    def fitted_with(self, name: str) -> float:
-        """`prior_scale`, `steepness` or `lapse_rate` of the last fit, by evidence perhaps; else by settings."""
-        posterior = self.posterior
-        return float(getattr(self.settings, name) if posterior is None else posterior.attrs[name])
+        """Draws of the sampled posterior; None without one."""
+        fit = sampled(self.estimate)
+        return None if fit is None else fit.posterior
 
     @property
-    def dynamics(self) -> Any:
-        """The environment's pure functions, where it has some."""
-        return getattr(getattr(self.environment, "unwrapped", None), "dynamics", None)
+    def without_posterior(self) -> bool:
+        """Whether the run's estimation method has no posterior."""
+        return self.settings.estimation.utility in WITHOUT_POSTERIOR
+
+    @property
+    def posterior_missing(self) -> str:
+        """Why there is no posterior, as a sentence."""
+        if self.without_posterior:
+            return f"The estimation method {self.settings.estimation.utility} has no posterior: no uncertainty to show."
+        return "No posterior can be read." if self.iterations else "No posterior yet."
+
+    @property
+    def model(self) -> PreferenceModel:
+        """Prior and likelihood of the last fit, or of the settings without one."""
+        return self.settings.model if self.posterior is None else fitted_model(self.posterior)
+
+    def environment_attribute(self, name: str) -> Any:
+        """`optimal_return` and the like of the environment; None where it has none."""
+        return None if self.environment is None else environment_attribute(self.environment, name)
 
 
-def read_evidence(directory: Path | str, *, env: Any = None, features: Any = None) -> Evidence:
+def read_contents(
+    directory: Path | str, *, env: gymnasium.Env | FuncEnv | None = None, features: StateFeatures | None = None
+) -> RunContents:
     """Read all that can be read of a run directory, and change nothing.
 
     Args:
-      directory: of a run, finished or not, whole or not.
-      env, features: what the run was started with, where these were objects of the user's.
+      directory: of a run, finished or not, complete or not.
+      env, features: the objects that the run was started with, where these were your own.
 
     Raises:
       ValueError: a directory that is no run, or one of a newer version.
     """
     run = RunDirectory.open(directory)
     log = read_log(run.path, run.settings)
-    broken, records = list(log.broken), list(log.answers)
-    environment = _environment(run.settings, env, broken)
-    reader = _Reader(run, features, broken)
+    damage, answers = list(log.damage), list(log.answers)
+    environment = _environment(run.settings, env, damage)
+    reader = _IterationReader(run, features, damage)
     for number in range(1, max(log.collected, len(log.summaries)) + 1):
-        records = reader.read(number, records, improved=number <= len(log.summaries))
-    return Evidence(
+        answers = reader.read(number, answers, improved=number <= len(log.summaries))
+    return RunContents(
         path=run.path,
         settings=run.settings,
         iterations=log.summaries,
-        answers=tuple(records),
+        answers=tuple(answers),
         preferences=log.state.preferences,
         trajectories=reader.trajectories,
         estimate=reader.estimate,
         estimate_iteration=reader.estimate_iteration,
         features_missing=reader.features_missing,
         environment=environment,
-        waiting=None if log.state.query is None else log.state.query.number,
-        broken=tuple(broken),
+        open_question=None if log.state.query is None else log.state.query.number,
+        damage=tuple(damage),
     )
 
 
@@ -113,75 +132,74 @@ def _not_passed(states: np.ndarray) -> np.ndarray:
     raise ValueError("features: expected those that the run was started with, got none")
 
 
-class _Reader:
-    """Reads one iteration's file after the other, and predicts its answers by the estimate from before them."""
+class _IterationReader:
+    """Reads the iteration files in turn, and predicts the answers of each by the estimate of the one before."""
 
-    def __init__(self, run: RunDirectory, features: Callable[[np.ndarray], np.ndarray] | None, broken: list[str]):
-        self.run, self.broken, self.features, self.features_missing = run, broken, features, ""
-        if features is None and run.settings.features == "other":
+    def __init__(self, run: RunDirectory, features: StateFeatures | None, damage: list[ReportWarning]) -> None:
+        self.run, self.damage, self.features, self.features_missing = run, damage, features, ""
+        if features is None and run.settings.features.features == "other":
             self.features, self.features_missing = _not_passed, "it was not passed again"
         self.trajectories: dict[int, Trajectory] = {}
-        self.estimate: Any = None
+        self.estimate: UtilityEstimate | None = None
         self.estimate_iteration = 0
 
-    def read(self, number: int, records: list[AnswerRecord], *, improved: bool) -> list[AnswerRecord]:
-        """`records` with the predictions of the answers of iteration `number`."""
-        file = self.run.iteration_file(number)
-        parts: dict[str, Any] = {}
-        try:
-            parts = read_parts(
-                file, ("trajectories", "estimate") if improved else ("trajectories",), features=self.features
-            )
-        except ValueError as error:
-            self.broken.append(f"iterations/{error}.")
-            with suppress(ValueError):  # it may be only the estimate that cannot be read
-                parts = read_parts(file, ("trajectories",))
+    def read(self, iteration: int, answers: Sequence[AnsweredQuestion], *, improved: bool) -> list[AnsweredQuestion]:
+        """`answers` with the predictions of those of this iteration."""
+        parts = self._parts(iteration, ("trajectories", "estimate") if improved else ("trajectories",))
         if not parts:
-            return records
-        first = (number - 1) * self.run.settings.trajectories_per_iteration
+            return list(answers)
+        first = (iteration - 1) * self.run.settings.rollouts.trajectories_per_iteration
         self.trajectories |= dict(enumerate(parts["trajectories"], start=first))
-        if self.estimate_iteration == number - 1:
-            records = [self._predicted(record) if record.iteration == number else record for record in records]
+        if self.estimate_iteration == iteration - 1:
+            answers = [self._predicted(answer) if answer.iteration == iteration else answer for answer in answers]
         if "estimate" in parts:
-            self.estimate, self.estimate_iteration = parts["estimate"], number
-            self.features_missing = self.features_missing or self._failure(parts["trajectories"][0])
-        return records
+            self.estimate, self.estimate_iteration = parts["estimate"], iteration
+            self.features_missing = self.features_missing or self._features_failure(parts["trajectories"][0])
+        return list(answers)
 
-    def _failure(self, trajectory: Trajectory) -> str:
-        """What is wrong with features that were passed."""
-        if self.features is None or not hasattr(self.estimate, "weights"):
+    def _parts(self, iteration: int, names: tuple[str, ...]) -> dict[str, Any]:
+        file = self.run.iteration_file(iteration)
+        try:
+            return read_parts(file, names, features=self.features)
+        except ValueError as error:
+            remedy = "Restore this file from a copy: its contents are missing here, and the run cannot continue."
+            self.damage.append(ReportWarning(f"Missing data: iterations/{error}.", remedy))
+        with suppress(ValueError):  # only the estimate may be unreadable
+            return read_parts(file, ("trajectories",))
+        return {}
+
+    def _features_failure(self, trajectory: Trajectory) -> str:
+        """What is wrong with features that were passed; empty if nothing."""
+        if self.features is None or not of_states(self.estimate):
             return ""
         try:
-            number = checked_features(self.features, trajectory.states).shape[1]
+            width = checked_features(self.features, trajectory.states).shape[1]
         except Exception as error:  # a function of the user's may raise anything
             return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
-        expected = len(self.estimate.weights)
-        return "" if number == expected else f"the one that was passed has {number} features, the run's {expected}"
+        expected = len(one_setting(self.estimate).weights)
+        return "" if width == expected else f"the one that was passed has {width} features, the run's {expected}"
 
-    def _predicted(self, record: AnswerRecord) -> AnswerRecord:
-        numbers = (record.first, record.second)
+    def _predicted(self, answer: AnsweredQuestion) -> AnsweredQuestion:
+        numbers = (answer.first, answer.second)
         both = [self.trajectories[number] for number in numbers if number in self.trajectories]
-        if self.run.settings.utility in WITHOUT_POSTERIOR or len(both) < 2:
-            return record
+        if self.run.settings.estimation.utility in WITHOUT_POSTERIOR or len(both) < 2:
+            return answer
         if self.estimate is None:
-            probability = 0.5  # before any answer, the prior says nothing of which is better
-        elif getattr(self.estimate, "posterior", None) is None or self.features_missing:
-            return record
-        elif isinstance(self.estimate, AveragedUtility):
-            margins = self.estimate.margin_draws(*both)
-            probability = float(prob(self.estimate.likelihood, margins).mean())
-        else:
-            sums = trajectory_features(both, self.estimate.features, discount=self.estimate.discount)
-            difference = (sums[[0]] - sums[[1]]) / self.estimate.scale
-            probability = float(answer_probabilities(self.estimate.posterior, difference)[0, PREFERRED])
-        return AnswerRecord(**{**vars(record), "predicted": probability})
+            return replace(answer, predicted=0.5)  # without any answer, either is equally probable
+        if sampled(self.estimate) is None or self.features_missing:
+            return answer
+        return replace(answer, predicted=first_preferred_probability(self.estimate, *both))
 
 
-def _environment(settings: Settings, env: Any, broken: list[str]) -> Any:
+def _environment(
+    settings: Settings, env: gymnasium.Env | FuncEnv | None, damage: list[ReportWarning]
+) -> gymnasium.Env | None:
     try:
         if env is None and settings.environment == "other":
-            raise ValueError(f"{settings.env} was an object of the user's, and is passed to bayespbrl.load as env=")
+            raise ValueError(f"{settings.env} is an object of your own: pass it to bayespbrl.load as env=")
         return open_environment(settings.env if env is None else env)
     except ValueError as error:
-        broken.append(f"The environment cannot be opened ({error}): what needs it is left out.")
+        what = f"The environment cannot be opened ({error}). What needs it is missing here."
+        remedy = "Register it first, or call bayespbrl.load(directory, env=...).report() with the object."
+        damage.append(ReportWarning(what, remedy))
         return None

@@ -1,4 +1,4 @@
-"""What a report is made of, whatever the format: sections of text, pictures, tables and comparisons."""
+"""A report as data, whatever its format: warnings, and sections of text, pictures, tables and comparisons."""
 
 import io
 from base64 import b64encode
@@ -8,15 +8,22 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
 
 @dataclass(frozen=True)
+class ReportWarning:
+    """A problem, in one sentence or two, and its remedy."""
+
+    what: str
+    remedy: str
+
+
+@dataclass(frozen=True)
 class Picture:
-    """A PNG of so many inches' width, its caption, and a text for who cannot see it; `name` is its file's."""
+    """A PNG, the name of its file, its caption, its alternative text and its width in inches."""
 
     name: str
     png: bytes
@@ -27,12 +34,13 @@ class Picture:
 
     @property
     def data_uri(self) -> str:
+        """The picture as an address that HTML can embed."""
         return "data:image/png;base64," + b64encode(self.png).decode()
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of texts under their heads."""
+    """A caption, column heads and rows of text."""
 
     caption: str
     head: Sequence[str]
@@ -51,39 +59,55 @@ class Comparison:
     kind: str = "comparison"
 
 
+Block = Picture | Table | Comparison
+Body = tuple[Sequence[str], Sequence[Block]]  # the paragraphs of a section, and what stands below them
+
+
 @dataclass(frozen=True)
 class Section:
     """A heading, paragraphs, and what stands below them."""
 
     name: str
     title: str
-    text: Sequence[str] = ()
-    blocks: Sequence[Picture | Table | Comparison] = ()
+    text: Sequence[str]
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that the templates name."""
+
+    title: str
+    state: str
+    facts: Sequence[tuple[str, str]]
+    summary: Sequence[str]
+    warnings: Sequence[ReportWarning]
+    sections: Sequence[Section]
+    made: str
 
 
 def drawn(
     name: str,
-    panels: Sequence[tuple[str, Callable[[Axes], Any]]],
+    panels: Sequence[tuple[str, Callable[[Axes], object]]],
     caption: str,
     alt: str,
     *,
     columns: int = 2,
     size: tuple[float, float] = (4.4, 3.1),
 ) -> Picture:
-    """A picture of panels, each a title and a function that draws on axes.
+    """A picture of panels.
 
     Args:
       name: of its file.
-      panels: at least one.
+      panels: at least one, each a title and a function that draws on axes.
       caption, alt: in words.
       columns: of panels.
       size: of a panel, inches.
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    room = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08, wspace=0.05, hspace=0.05)
-    figure = Figure(figsize=(columns * size[0], rows * size[1]), layout=room)
-    FigureCanvasAgg(figure)
+    layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08, wspace=0.05, hspace=0.05)
+    figure = Figure(figsize=(columns * size[0], rows * size[1]), layout=layout)
     grid = np.ravel(figure.subplots(rows, columns, squeeze=False))
     for axes, (title, draw) in zip(grid, panels, strict=False):
         draw(axes)
@@ -93,17 +117,16 @@ def drawn(
     return Picture(name, _png(figure, dpi=150, colours=256), caption, alt, columns * size[0])
 
 
-def thumbnail(name: str, draw: Callable[[Axes], Any], caption: str, alt: str) -> Picture:
-    """A small picture of what `draw` draws, in few colours and a few kilobytes."""
+def thumbnail(name: str, draw: Callable[[Axes], object], caption: str, alt: str) -> Picture:
+    """A small picture of what `draw` draws, in 64 colours and a few kilobytes."""
     figure = Figure(figsize=(4.4, 3.4))
-    FigureCanvasAgg(figure)
     draw(figure.subplots())
     return Picture(name, _png(figure, dpi=85, colours=64, bbox_inches="tight", pad_inches=0.03), caption, alt)
 
 
 def _png(figure: Figure, *, dpi: int, colours: int, **options: Any) -> bytes:
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=dpi, **options)
-    image = Image.open(drawn).convert("RGB")
+    full, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(full, format="png", dpi=dpi, **options)
+    image = Image.open(full).convert("RGB")
     image.quantize(colours, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
     return small.getvalue()

@@ -1,4 +1,4 @@
-"""The figures of a report that no other module has. Each draws on the matplotlib axes it is given and returns them."""
+"""The figures of a report. Each function draws on the matplotlib axes it is given and returns them."""
 
 from typing import Any
 
@@ -7,16 +7,16 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-SETTLED, OPEN = "#1b6ca8", "#c2571a"
+MAIN, ACCENT = "#1b6ca8", "#c2571a"
 
 
 def plot_value(table: xr.Dataset, axes: Axes, *, optimum: float | None = None) -> Axes:
-    """Value of each iteration's policy against the answers so far; the best one marked."""
+    """Value of each iteration's policy against the number of answers; the best one is marked."""
     answers, value = table["answers"].values, table["value"].values
-    axes.plot(answers, value, marker="o", markersize=3.5, color=SETTLED)
+    axes.plot(answers, value, marker="o", markersize=3.5, color=MAIN)
     if np.isfinite(value).any():
         best = int(np.nanargmax(value))
-        axes.plot(answers[best], value[best], "*", markersize=13, color=OPEN, label=f"best: {value[best]:.4g}")
+        axes.plot(answers[best], value[best], "*", markersize=13, color=ACCENT, label=f"best: {value[best]:.4g}")
     if optimum is not None:
         axes.axhline(optimum, color="0.4", linestyle="--", linewidth=1, label=f"optimum: {optimum:.4g}")
     axes.set(xlabel="answers", ylabel="mean return of fresh episodes")
@@ -27,15 +27,15 @@ def plot_value(table: xr.Dataset, axes: Axes, *, optimum: float | None = None) -
 
 
 def plot_progress(table: xr.Dataset, axes: Axes) -> Axes:
-    """What the last estimate thinks of each iteration's trajectories, with its 90 % interval, over the last's."""
+    """Utility of each iteration's trajectories by the last estimate, relative to the last's, with its 90 % interval."""
     iterations = table["iteration"].values
     if "lower" in table:
         axes.fill_between(
-            iterations, table["lower"], table["upper"], alpha=0.25, linewidth=0, color=SETTLED, label="90 % interval"
+            iterations, table["lower"], table["upper"], alpha=0.25, linewidth=0, color=MAIN, label="90 % interval"
         )
-    axes.plot(iterations, table["utility"], marker="o", markersize=3.5, color=SETTLED, label="expected utility")
+    axes.plot(iterations, table["utility"], marker="o", markersize=3.5, color=MAIN, label="expected utility")
     axes.axhline(0, color="0.4", linestyle="--", linewidth=1)
-    axes.set(xlabel="iteration", ylabel="inferred utility over the last's")
+    axes.set(xlabel="iteration", ylabel="utility relative to the last")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend()
     return axes
@@ -52,16 +52,16 @@ def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = 1.01) -> Axes:
 
 
 def plot_effective_sample_size(table: xr.Dataset, axes: Axes, *, limit: float = 400.0) -> Axes:
-    """Effective draws of the worst margin of each iteration's fit."""
+    """Effective sample size of the worst margin of each iteration's fit."""
     _series(table, axes, {"effective_sample_size_min": "worst margin"}, converged="utility_converged")
     axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")
-    axes.set(ylabel="effective draws", ylim=(0, None))
+    axes.set(ylabel="effective sample size", ylim=(0, None))
     axes.legend()
     return axes
 
 
 def plot_bound(table: xr.Dataset, axes: Axes) -> Axes:
-    """The KL bound, the KL that REPS reached and that of the policy fitted to it, on a logarithmic scale."""
+    """The KL bound, the KL that REPS reached and the fitted policy's KL, on a logarithmic scale."""
     names = {"kl_bound": "bound", "kl": "reached by REPS", "kl_fitted_policy": "fitted policy"}
     values = np.concatenate([table[name].values for name in names])
     positive = values[np.isfinite(values) & (values > 0)]
@@ -73,7 +73,7 @@ def plot_bound(table: xr.Dataset, axes: Axes) -> Axes:
 
 
 def plot_temperature(table: xr.Dataset, axes: Axes) -> Axes:
-    """REPS's temperature on a logarithmic scale; updates whose solver did not meet its tolerance are marked."""
+    """Temperature of REPS on a logarithmic scale; crosses mark updates whose solver did not converge."""
     _series(table, axes, {"temperature": "temperature"}, converged="reps_converged")
     if np.nanmin(table["temperature"].values, initial=np.inf) > 0:
         axes.set_yscale("log")
@@ -82,33 +82,33 @@ def plot_temperature(table: xr.Dataset, axes: Axes) -> Axes:
 
 
 def plot_entropy(table: xr.Dataset, axes: Axes) -> Axes:
-    """Mean entropy of each iteration's policy over the visited states, and its action noise where that is known."""
+    """Mean entropy of each iteration's policy over the visited states, and its action noise where there is one."""
     _series(table, axes, {"entropy": "entropy"})
     axes.set(ylabel="entropy (nats)")
     spread = table["action_standard_deviation"].values
     if np.isfinite(spread).any():
         other = axes.twinx()
-        other.plot(table["iteration"], spread, "s--", markersize=3, color=OPEN, label="standard deviation")
+        other.plot(table["iteration"], spread, "s--", markersize=3, color=ACCENT, label="standard deviation")
         other.set(ylabel="standard deviation of the action", ylim=(0, None))
         other.legend(loc="lower left")
     return axes
 
 
 def plot_column(table: xr.Dataset, name: str, axes: Axes, *, label: str | None = None) -> Axes:
-    """Any one number of each iteration; `label` is its own name unless told."""
+    """One variable of the iterations; `label` is its name by default."""
     _series(table, axes, {name: name})
     axes.set(ylabel=(name if label is None else label).replace("_", " "))
     return axes
 
 
 def plot_states(table: xr.Dataset, values: np.ndarray, axes: Axes, *, label: str, **limits: Any) -> Axes:
-    """One number of each state: a map, or coloured points, by the `kind` of a `utility_table`.
+    """One number of each state, as a map or as coloured points, by the `kind` of the table.
 
     Args:
       table: what `utility_table` returned.
       values: shape (state,); NaN stays blank.
       axes: to draw on.
-      label: what the numbers are.
+      label: of the colour bar.
       **limits: `vmin`, `vmax` and `cmap` of the colours.
     """
     kind, states = table.attrs["kind"], table["states"].values
@@ -134,16 +134,16 @@ def plot_states(table: xr.Dataset, values: np.ndarray, axes: Axes, *, label: str
 
 
 def plot_state_bands(table: xr.Dataset, axes: Axes) -> Axes:
-    """Mean utility of each state with two standard deviations either way: of states in a list or on a line."""
+    """Mean utility ± two standard deviations of states in a list or on a line."""
     states, certain = table["states"].values.reshape(table.sizes["state"]), "sd" not in table
     mean = table["used" if certain else "mean"].values
     sd = np.zeros(len(mean)) if certain else table["sd"].values
     if table.attrs["kind"] == "line":
         axes.fill_between(states, mean - 2 * sd, mean + 2 * sd, alpha=0.25, linewidth=0, label="± 2 sd")
-        axes.plot(states, mean, color=SETTLED, label="mean")
+        axes.plot(states, mean, color=MAIN, label="mean")
         axes.set(xlabel="observation 0", ylabel="utility")
     else:
-        axes.errorbar(states, mean, yerr=2 * sd, fmt="o", markersize=4, capsize=2, color=SETTLED, label="mean ± 2 sd")
+        axes.errorbar(states, mean, yerr=2 * sd, fmt="o", markersize=4, capsize=2, color=MAIN, label="mean ± 2 sd")
         axes.set(xlabel="state", ylabel="utility")
     axes.axhline(0, color="0.6", linewidth=0.8)
     axes.legend()
@@ -151,12 +151,12 @@ def plot_state_bands(table: xr.Dataset, axes: Axes) -> Axes:
 
 
 def plot_trajectories(table: xr.Dataset, axes: Axes) -> Axes:
-    """Inferred utility of the trajectories that were asked about, with 90 % intervals, against their hidden return."""
+    """Inferred utility of the compared trajectories, with 90 % intervals, against their hidden return."""
     x, y = table["hidden_return"].values, table["utility"].values
     if "lower" in table:
         reach = np.abs(np.stack([y - table["lower"].values, table["upper"].values - y]))
         axes.errorbar(x, y, yerr=reach, fmt="none", ecolor="0.7", elinewidth=1, label="90 % interval")
-    axes.plot(x, y, "o", markersize=4, color=SETTLED)
+    axes.plot(x, y, "o", markersize=4, color=MAIN)
     axes.set(xlabel="hidden return (the learner never sees it)", ylabel="inferred utility")
     if "lower" in table:
         axes.legend()
@@ -164,17 +164,17 @@ def plot_trajectories(table: xr.Dataset, axes: Axes) -> Axes:
 
 
 def plot_answers(table: xr.Dataset, axes: Axes) -> Axes:
-    """Probability of each answer that was given: before it was, and by the last posterior."""
+    """Probability of each answer before it was given and by the last posterior."""
     question = table["question"].values
     after, before = table["probability"].values, table["before"].values
     axes.vlines(question, np.fmin(before, after), np.fmax(before, after), color="0.8", linewidth=1)
     axes.plot(question, before, "o", fillstyle="none", markersize=5, color="0.4", label="before it was given")
-    axes.plot(question, after, "o", markersize=4, color=SETTLED, label="given all answers")
+    axes.plot(question, after, "o", markersize=4, color=MAIN, label="given all answers")
     wrong = after < 0.5
     if wrong.any():
-        axes.plot(question[wrong], after[wrong], "o", markersize=6, color=OPEN, label="improbable to the end")
+        axes.plot(question[wrong], after[wrong], "o", markersize=6, color=ACCENT, label="improbable given all answers")
     axes.axhline(0.5, color="0.4", linestyle="--", linewidth=1)
-    axes.set(xlabel="question", ylabel="probability of the answer given", ylim=(-0.03, 1.03))
+    axes.set(xlabel="question", ylabel="probability of the answer", ylim=(-0.03, 1.03))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False)
     return axes
@@ -184,11 +184,11 @@ def _series(table: xr.Dataset, axes: Axes, names: dict[str, str], *, converged: 
     iterations = table["iteration"].values
     for number, (name, label) in enumerate(names.items()):
         look: dict[str, Any] = {"marker": "o", "markersize": 3.5, "color": f"C{number}"}
-        if number == 0 and len(names) > 1:  # what the others are held against: on top, and they show through
+        if number == 0 and len(names) > 1:  # the reference for the others: drawn on top, but thin
             look = {"linestyle": "--", "marker": "_", "markersize": 5, "color": "0.2", "linewidth": 1.2, "zorder": 3}
         axes.plot(iterations, table[name], label=label, **look)
         if converged is not None and (failed := table[converged].values == 0).any():
             at = table[name].values[failed]
-            axes.plot(iterations[failed], at, "x", markersize=9, color=OPEN, label="not converged")
+            axes.plot(iterations[failed], at, "x", markersize=9, color=ACCENT, label="not converged")
     axes.set_xlabel("iteration")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -1,33 +1,37 @@
-"""The log of a run as far as it can be read: the learner's state without its heavy parts, the answers, the summaries.
+"""What can be read of the log of a run: the learner's state without its heavy parts, the answers, the summaries.
 
-The same fold as the learner's own; where it cannot go on, what is read so far counts, and a sentence says why.
+The events are applied as the learner applies them. Where one cannot be applied, those before it count, and a warning
+says why.
 """
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bayespbrl import events
+from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.preferences import Answer
-from bayespbrl.runs.directory import read_summary
+from bayespbrl.runs.directory import PartialLine, read_log_lines, read_summary
 from bayespbrl.settings import Settings
+
+Summary = Mapping[str, Any]  # the figures of one iteration, as JSON has them
+Event = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class AnswerRecord:
+class AnsweredQuestion:
     """One question that was answered.
 
     Attributes:
       question: its number, from 1.
       iteration: in which it was asked, from 1.
       first, second: numbers of the two trajectories in the order shown.
-      answer: what the expert said.
+      answer: the expert's.
       row: which of the K ordered pairs it is; None where it gave none (a tie, a skip).
       predicted: probability that the first is preferred, by the estimate that the learner had when it asked; NaN where
-        that was no posterior or cannot be read.
+        that has no posterior or cannot be read.
     """
 
     question: int
@@ -41,73 +45,73 @@ class AnswerRecord:
 
 @dataclass(frozen=True)
 class RunLog:
-    """What the log says.
+    """The readable part of a log.
 
     Attributes:
       state: the learner's, with None in place of trajectories, policy and estimate.
-      answers: in their order, those taken back left out.
+      answers: in their order, without those taken back.
       summaries: of the completed iterations.
-      collected: how many iterations have trajectories.
-      broken: what could not be read, a sentence each.
+      collected: number of iterations with trajectories.
+      damage: one warning for each thing that cannot be read.
     """
 
     state: LearnerState
-    answers: tuple[AnswerRecord, ...]
-    summaries: tuple[Mapping[str, Any], ...]
+    answers: tuple[AnsweredQuestion, ...]
+    summaries: tuple[Summary, ...]
     collected: int
-    broken: tuple[str, ...]
+    damage: tuple[ReportWarning, ...]
 
 
 def read_log(path: Path, settings: Settings) -> RunLog:
-    """Read `events.jsonl` and `summary.json` of the run directory `path`, whole or not."""
-    broken: list[str] = []
-    state, answers, collected = _folded(_surviving(path, broken), settings, broken)
-    summaries = _summaries(path, state, broken)
-    return RunLog(state, tuple(answers), summaries, collected, tuple(broken))
+    """Read `events.jsonl` and `summary.json` of the run directory `path`, complete or not."""
+    damage: list[ReportWarning] = []
+    state, answers, collected = _applied(_surviving_events(path, damage), settings, damage)
+    summaries = _summaries(path, state, damage)
+    return RunLog(state, tuple(answers), summaries, collected, tuple(damage))
 
 
-def _surviving(path: Path, broken: list[str]) -> list[Mapping[str, Any]]:
-    """The events up to the first line that is none, what was undone left out."""
-    file = path / "events.jsonl"
-    if not file.exists():
-        return []
+def _damage(text: str) -> ReportWarning:
+    remedy = "The report uses the part that can be read. Restore the file from a copy before you continue the run."
+    return ReportWarning(f"Missing data: {text}.", remedy)
+
+
+def _surviving_events(path: Path, damage: list[ReportWarning]) -> Sequence[Event]:
+    """The events up to the first unreadable line, without those that were undone."""
     try:
-        *lines, rest = file.read_text(encoding="utf-8", errors="replace").split("\n")
+        lines = read_log_lines(path / "events.jsonl")
     except OSError as error:
-        broken.append(f"events.jsonl cannot be read ({error}).")
+        damage.append(_damage(f"events.jsonl cannot be read ({error})"))
         return []
-    if rest:
-        broken.append("events.jsonl: the last line is cut off, as a process killed while writing leaves it.")
-    log: list[Mapping[str, Any]] = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            event = json.loads(line)
-        except ValueError:
-            event = None
-        if not isinstance(event, dict) or "event" not in event:
-            broken.append(f"events.jsonl, line {number}: no event; this line and what follows is left out.")
+    log: list[Event] = []
+    for line in lines:
+        if isinstance(line, PartialLine):
+            remedy = "No action is needed if nothing else is damaged: bayespbrl resume drops this line and continues."
+            damage.append(ReportWarning(f"Missing data: {line}, as a process killed while writing leaves it.", remedy))
+        elif isinstance(line, ValueError):
+            damage.append(_damage(f"{line}; this line and all that follow are left out"))
             break
-        log.append(event)
+        else:
+            log.append(line)
     try:
         return events.surviving(log)
     except ValueError as error:
-        broken.append(f"events.jsonl: {error}.")
+        damage.append(_damage(f"events.jsonl: {error}"))
         return [event for event in log if event["event"] != "undone"]
 
 
-def _folded(
-    log: list[Mapping[str, Any]], settings: Settings, broken: list[str]
-) -> tuple[LearnerState, list[AnswerRecord], int]:
-    """The learner's state without its heavy parts, the answers, and how many iterations have trajectories."""
-    state, records, collected = LearnerState(None), [], 0
-    # what the fold asks of the heavy parts is that they are there
-    parts = {"trajectories": [None] * settings.trajectories_per_iteration, "policy": None, "estimate": None}
+def _applied(
+    log: Sequence[Event], settings: Settings, damage: list[ReportWarning]
+) -> tuple[LearnerState, list[AnsweredQuestion], int]:
+    """The learner's state without its heavy parts, the answers, and the number of iterations with trajectories."""
+    state, answers, collected = LearnerState(None), [], 0
+    # stand-ins: applying an event only needs the heavy parts to be there
+    parts = {"trajectories": [None] * settings.rollouts.trajectories_per_iteration, "policy": None, "estimate": None}
     for event in log:
         query, pairs = state.query, len(state.preferences.pairs)
         try:
             state = events.replay(state, [Entry(event, parts)])
         except ValueError as error:
-            broken.append(f"events.jsonl: {error}; what follows is left out.")
+            damage.append(_damage(f"events.jsonl: {error}; what follows is left out"))
             break
         if event["event"] == "collected":
             collected += 1
@@ -115,11 +119,11 @@ def _folded(
             after = len(state.preferences.pairs)
             row = after - 1 if after > pairs else None  # the pair that was asked about is the last of its answer's
             answer = Answer(event["answer"])
-            records.append(AnswerRecord(query.number, state.iteration + 1, query.first, query.second, answer, row))
-    return state, records, collected
+            answers.append(AnsweredQuestion(query.number, state.iteration + 1, query.first, query.second, answer, row))
+    return state, answers, collected
 
 
-def _summaries(path: Path, state: LearnerState, broken: list[str]) -> tuple[Mapping[str, Any], ...]:
+def _summaries(path: Path, state: LearnerState, damage: list[ReportWarning]) -> tuple[Summary, ...]:
     """Summaries by the log, or by `summary.json` where the log has fewer."""
     logged = tuple(summary for summary in state.summaries if isinstance(summary, Mapping))
     if not (path / "summary.json").exists():
@@ -127,10 +131,15 @@ def _summaries(path: Path, state: LearnerState, broken: list[str]) -> tuple[Mapp
     try:
         kept = read_summary(path)["iterations"]
     except ValueError as error:
-        broken.append(f"{error}.")
+        damage.append(_damage(str(error)))
         return logged
     kept = tuple(summary for summary in kept if isinstance(summary, Mapping)) if isinstance(kept, list) else ()
-    if len(kept) > len(logged):
-        broken.append(f"events.jsonl holds {len(logged)} completed iterations, summary.json {len(kept)}.")
-        return kept
-    return logged
+    if len(kept) <= len(logged):
+        return logged
+    what = f"events.jsonl holds {len(logged)} completed iterations, summary.json {len(kept)}."
+    remedy = (
+        "The report uses summary.json. Unless an interruption explains the difference, restore the log from a copy: "
+        "the run cannot continue without it."
+    )
+    damage.append(ReportWarning(f"Missing data: {what}", remedy))
+    return kept

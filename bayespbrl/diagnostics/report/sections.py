@@ -1,127 +1,137 @@
-"""The sections of a report, each a function of the evidence: the texts say what to look for in each picture."""
+"""The other sections of a report: learning curve, convergence, calibration, policy updates, sensitivity, iterations."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ranks
+from bayespbrl.diagnostics.estimates import expect_sampled, of_states
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.prequential import plot_calibration
 from bayespbrl.diagnostics.report import figures
-from bayespbrl.diagnostics.report.contents import Evidence
-from bayespbrl.diagnostics.report.document import Section, Table, drawn
-from bayespbrl.diagnostics.report.summary import cell, figure, iterations_that_asked_nothing, no_posterior
-from bayespbrl.diagnostics.report.tables import progress_table
+from bayespbrl.diagnostics.report.contents import RunContents
+from bayespbrl.diagnostics.report.document import Block, Body, Picture, Table, drawn
+from bayespbrl.diagnostics.report.formatting import cell, number
+from bayespbrl.diagnostics.report.tables import iterations_without_question, progress_table
 from bayespbrl.diagnostics.uncertainty import thinned
-from bayespbrl.settings import WITHOUT_POSTERIOR
 
-RANKED = 4
+RANK_PLOTS = 4  # of the margins with the largest R̂
+SENSITIVITY_DRAWS = 4000
+FEW_ANSWERS = 15  # with fewer the band of the reliability curve is too wide to conclude from
+COLUMNS = {
+    "answers": "answers",
+    "value": "value",
+    "kl_bound": "bound",
+    "kl": "KL",
+    "kl_fitted_policy": "KL fitted",
+    "updates": "updates",
+    "temperature": "temperature",
+    "entropy": "entropy",
+    "rhat_max": "R̂",
+    "effective_sample_size_min": "eff. draws",
+    "pairs_satisfied": "satisfied",
+    "pairs": "of pairs",
+}
 
 
-def learning(evidence: Evidence, iterations: xr.Dataset) -> Section:
+def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
     """The learning curve, by the hidden reward and by the inferred utility."""
     if not iterations.sizes["iteration"]:
-        return Section("learning", "Learning curve", ["No iteration is completed yet."])
-    optimum = getattr(evidence.dynamics, "optimal_return", None)
-    quiet = iterations_that_asked_nothing(evidence, iterations)
+        return ["No iteration is completed yet."], []
+    optimum = contents.environment_attribute("optimal_return")
     panels = [("Value against answers", partial(figures.plot_value, iterations, optimum=optimum))]
     caption = (
-        "Each point is the policy after an update, valued by fresh episodes whose reward the learner never sees. "
-        "Look for a rise that levels off, and for falls after it."
-        + (" Points above one another are of iterations that asked nothing." if quiet else "")
+        "Each point is the value of the policy after an update: the mean return of fresh episodes, which the learner "
+        "never sees. Look for a rise that levels off, and for drops after it."
     )
+    if iterations_without_question(contents, iterations):
+        caption += " Points above one another are iterations without a question."
     first, last = float(iterations["value"][0]), float(iterations["value"][-1])
-    alt = f"Learning curve: value from {figure(first)} to {figure(last)} over {int(iterations['answers'][-1])} answers."
+    alt = f"Learning curve: value from {number(first)} to {number(last)} over {int(iterations['answers'][-1])} answers."
     blocks = [drawn("learning", panels, caption, alt, columns=1, size=(7.6, 3.3))]
-    if hasattr(evidence.estimate, "weights") and not evidence.features_missing:  # the reward itself has none
-        panels = [("By the inferred utility", partial(figures.plot_progress, progress_table(evidence)))]
+    if of_states(contents.estimate) and not contents.features_missing:
+        curve = [("By the inferred utility", partial(figures.plot_progress, progress_table(contents)))]
         caption = (
-            "What the last estimate thinks of the trajectories of each iteration, over those of the last; the scale is "
-            "free. No reward enters, so this is the learning curve of a run whose answers a person gives. Where the "
-            "interval is below zero the policy has become better since, by this utility; where it is level and holds "
-            "zero nothing more was gained, and whether what was gained is good is seen in the trajectories."
+            "Mean utility of each iteration's trajectories by the last estimate, relative to the last iteration's; the "
+            "scale is arbitrary. No reward enters, so this is the learning curve of a run with a person's answers. "
+            "Where the interval is below zero, the policy has become better since, by this utility. Where it is flat "
+            "and contains zero, nothing more was gained. Whether the gain is real, the trajectories show."
         )
         alt = "The inferred utility of each iteration's trajectories."
-        blocks.append(drawn("progress", panels, caption, alt, columns=1, size=(7.6, 3.0)))
-    return Section("learning", "Learning curve", [], blocks)
+        blocks.append(drawn("progress", curve, caption, alt, columns=1, size=(7.6, 3.0)))
+    return [], blocks
 
 
-def fits(evidence: Evidence, iterations: xr.Dataset) -> Section:
-    """Convergence of every fit, and ranks of the last."""
-    title = "Have the fits converged?"
-    if evidence.posterior is None:
-        return Section("convergence", title, [no_posterior(evidence)])
+def convergence_of_fits(contents: RunContents, iterations: xr.Dataset) -> Body:
+    """Convergence of every fit, and rank plots of the last."""
+    if contents.posterior is None:
+        return [contents.posterior_missing], []
     panels = [
         ("Largest R̂", partial(figures.plot_rhat, iterations)),
-        ("Effective draws", partial(figures.plot_effective_sample_size, iterations)),
+        ("Effective sample size", partial(figures.plot_effective_sample_size, iterations)),
     ]
-    every = drawn(
-        "convergence",
-        panels,
-        "Every fit's worst margin. R̂ should be below its limit and the effective draws above theirs; crosses mark fits "
-        "that did not converge within their cap of draws.",
-        "R̂ and effective sample size by iteration.",
+    caption = (
+        "The worst margin of each fit. R̂ should be below its limit and the effective sample size above its limit. "
+        "Crosses mark fits that did not converge within their cap of draws."
     )
-    result = convergence(evidence.posterior)
+    every = drawn("convergence", panels, caption, "R̂ and effective sample size by iteration.")
+    result = convergence(contents.posterior)
     if not result.sizes["preference"]:
-        return Section("convergence", title, ["The last fit has no preference to converge on."], [every])
-    worst = np.argsort(-result["rhat"].values, kind="stable")[:RANKED]
-    ranks = [(f"Ranks, preference {k}", partial(plot_ranks, evidence.posterior, preference=int(k))) for k in worst]
-    last = drawn(
+        return ["The last fit has no preference, and so nothing to converge."], [every]
+    margins = drawn(
         "margins",
-        [(f"The fit of iteration {evidence.estimate_iteration}", partial(plot_convergence, result))],
-        "Effective draws of every margin of the last fit, in the middle of its distribution (bulk) and in its tails.",
+        [(f"The fit of iteration {contents.estimate_iteration}", partial(plot_convergence, result))],
+        "Effective sample size of every margin of the last fit, in the bulk of its distribution and in its tails.",
         f"Effective sample sizes of {result.sizes['preference']} margins.",
         columns=1,
         size=(7.6, 2.8),
     )
-    rank_plots = drawn(
-        "ranks",
-        ranks,
-        "Ranks of each chain's draws among all, for the margins of largest R̂. Chains that agree are level about the "
-        "dashed line; one that leans to a side, or a hump, has not mixed.",
-        f"Rank plots of {len(ranks)} margins.",
-        size=(4.4, 2.6),
+    return [], [every, margins, _rank_plots(contents.posterior, result)]
+
+
+def _rank_plots(tree: xr.DataTree, result: xr.Dataset) -> Picture:
+    worst = np.argsort(-result["rhat"].values, kind="stable")[:RANK_PLOTS]
+    panels = [(f"Ranks, preference {k}", partial(plot_ranks, tree, preference=int(k))) for k in worst]
+    caption = (
+        "Rank plots of the margins with the largest R̂: ranks of each chain's draws among all draws. Chains that agree "
+        "are level at the dashed line; a chain with a slope or a hump has not mixed."
     )
-    return Section("convergence", title, [], [every, last, rank_plots])
+    return drawn("ranks", panels, caption, f"Rank plots of {len(panels)} margins.", size=(4.4, 2.6))
 
 
-def calibration(evidence: Evidence, scores: xr.Dataset) -> Section:
-    """Whether the predicted probabilities can be trusted."""
-    title = "Are its probabilities right?"
-    if evidence.settings.utility in WITHOUT_POSTERIOR:
-        return Section("calibration", title, [no_posterior(evidence)])
-    number = scores.sizes["prediction"]
-    if not number:
-        return Section("calibration", title, ["No answer has been given that could be predicted beforehand."])
+def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
+    """Whether the predicted probabilities of answers can be trusted."""
+    if contents.without_posterior:
+        return [contents.posterior_missing], []
+    total = scores.sizes["prediction"]
+    if not total:
+        return ["No answer could be predicted before it was given."], []
     rows = []
     for name, label in (("log_score", "log score (nats, summed)"), ("brier_score", "Brier score (mean)")):
-        got, expected, sd = (figure(float(scores[name + end])) for end in ("", "_expected", "_sd"))
+        got, expected, sd = (number(float(scores[name + end])) for end in ("", "_expected", "_sd"))
         rows.append([label, got, f"{expected} ± {sd}"])
-    rows += [[name, figure(float(scores[name])), ""] for name in ("miscalibration", "discrimination", "uncertainty")]
-    head = ["", "reached", "expected if every probability were right"]
+    rows += [[name, number(float(scores[name])), ""] for name in ("miscalibration", "discrimination", "uncertainty")]
     caption = "Each answer was predicted by the posterior that the learner had when it asked. 0 is the best score."
+    table = Table(caption, ["", "score", "expected if calibrated"], rows)
     curve = drawn(
         "calibration",
         [("", partial(plot_calibration, scores))],
-        "How often the trajectory shown first was preferred, against its predicted probability "
-        "(pool-adjacent-violators). Calibrated predictions stay within the band; a curve steeper than the diagonal "
-        "means that the model was not sure enough, a flatter one that it was too sure.",
-        f"Reliability curve of {number} predictions.",
+        "How often the trajectory shown first was preferred, against the predicted probability "
+        "(pool-adjacent-violators). Calibrated predictions stay within the band. A curve steeper than the diagonal is "
+        "underconfident, a flatter one overconfident.",
+        f"Reliability curve of {total} predictions.",
         columns=1,
         size=(5.6, 4.0),
     )
-    few = ["With so few answers the band is wide: little can be said."] if number < 15 else []
-    return Section("calibration", title, few, [curve, Table(caption, head, rows)])
+    few = ["The band is wide with so few answers: little can be concluded."] if total < FEW_ANSWERS else []
+    return few, [curve, table]
 
 
-def updates(evidence: Evidence, iterations: xr.Dataset) -> Section:
-    """The bound, the KL reached, the temperature, the entropy; what the schedule and the evidence chose."""
-    title = "The policy updates"
+def updates(iterations: xr.Dataset) -> Body:
+    """Bound, KL, temperature and entropy; what the schedule and the choice of hyperparameters reported."""
     if not iterations.sizes["iteration"]:
-        return Section("updates", title, ["No update has been made yet."])
+        return ["No update has been made yet."], []
     panels = [
         ("KL bound and KL", partial(figures.plot_bound, iterations)),
         ("Temperature", partial(figures.plot_temperature, iterations)),
@@ -129,86 +139,69 @@ def updates(evidence: Evidence, iterations: xr.Dataset) -> Section:
         ("Effective samples of REPS", partial(figures.plot_column, iterations, "effective_samples")),
     ]
     caption = (
-        "Where the KL reached is below the bound, the update had no more to gain. The fitted policy's KL should follow "
-        "the one that REPS asked for. An entropy that falls to nothing early is a policy that has stopped exploring."
+        "A KL below the bound means that the update had nothing more to gain. The fitted policy's KL should follow the "
+        "KL that REPS reached. An entropy that drops to zero early means that the policy has stopped exploring."
     )
     if (iterations["updates"] > 1).any():
         caption += (
-            " Where an iteration had several updates, the fitted policy's KL is that of all together, and the KL, the "
+            " Where an iteration had several updates, the fitted policy's KL is that of all together; the KL, the "
             "temperature and the effective samples of REPS are those of the last."
         )
-    blocks: list[Any] = [drawn("updates", panels, caption, "KL, temperature, entropy and effective samples.")]
-    text = []
-    for group, label in (("schedule", "the schedule of the KL bound"), ("hyperparameters", "the hyper-parameters")):
-        names = [str(name) for name in iterations.data_vars if str(name).startswith(group + " ")]
-        if not names:
-            continue
-        text.append(f"What decided {label} in each iteration is in the table below.")
-        numbers = [name for name in names if iterations[name].dtype.kind == "f" and iterations[name].notnull().any()]
-        if numbers:
-            shown = [
-                ("", partial(figures.plot_column, iterations, name, label=name.removeprefix(group + " ")))
-                for name in numbers[:4]
-            ]
-            blocks.append(drawn(group, shown, f"By iteration: {label}.", f"{label} by iteration."))
-        rows = [
-            [str(int(iterations["iteration"][i])), *(cell(iterations[name].values[i]) for name in names)]
-            for i in range(iterations.sizes["iteration"])
-        ]
-        head = ["iteration", *(name.removeprefix(group + " ") for name in names)]
-        blocks.append(Table(label[0].upper() + label[1:], head, rows))
-    return Section("updates", title, text, blocks)
+    blocks: list[Block] = [drawn("updates", panels, caption, "KL, temperature, entropy and effective samples.")]
+    for group, label in (("schedule", "Schedule of the KL bound"), ("hyperparameters", "Choice of hyperparameters")):
+        blocks += _reported(iterations, group, label)
+    return [], blocks
 
 
-def leaning(evidence: Evidence) -> Section:
+def _reported(iterations: xr.Dataset, group: str, label: str) -> list[Block]:
+    """The variables of a group, as a table, with figures of the first four that are numbers."""
+    names = [str(name) for name in iterations.data_vars if str(name).startswith(group + " ")]
+    if not names:
+        return []
+    short = {name: name.removeprefix(group + " ") for name in names}
+    numeric = [name for name in names if iterations[name].dtype.kind == "f" and iterations[name].notnull().any()]
+    panels = [("", partial(figures.plot_column, iterations, name, label=short[name])) for name in numeric[:4]]
+    rows = [
+        [str(int(iterations["iteration"][i])), *(cell(iterations[name].values[i]) for name in names)]
+        for i in range(iterations.sizes["iteration"])
+    ]
+    table = Table(f"{label}, by iteration.", ["iteration", *short.values()], rows)
+    return [*([drawn(group, panels, f"{label}, by iteration.", f"{label} by iteration.")] if panels else []), table]
+
+
+def sensitivity_to_model(contents: RunContents) -> Body:
     """Sensitivity to the prior scale σ and to the likelihood, whose steepness is m."""
-    title = "How much leans on σ and m"
-    if evidence.posterior is None:
-        return Section("sensitivity", title, [no_posterior(evidence)])
+    if contents.posterior is None:
+        return [contents.posterior_missing], []
     try:
-        result = sensitivity(thinned(evidence.estimate, 4000).posterior)
+        result = sensitivity(thinned(expect_sampled(contents.estimate), SENSITIVITY_DRAWS).posterior)
     except ValueError as error:  # ArviZ cannot smooth a tail of equal weights
-        few = "That happens while the answers are few and most draws explain them equally well."
-        return Section("sensitivity", title, [f"It cannot be estimated ({error}) {few}"])
-    number = result.sizes["quantity"]
-    if not number:
-        return Section("sensitivity", title, ["There is no preference yet that could lean on anything."])
+        few = "This happens while there are few answers and most draws explain them equally well."
+        return [f"The sensitivity cannot be estimated ({error}). {few}"], []
+    total = result.sizes["quantity"]
+    if not total:
+        return ["There is no preference yet whose margin could be sensitive."], []
     limit = result.attrs["threshold"]
     above = {part: int((result["sensitivity"].sel(component=part) >= limit).sum()) for part in ("prior", "likelihood")}
     text = [
-        f"Of {number} margins, {above['prior']} change noticeably (above {limit:g}) when the prior scale σ = "
-        f"{evidence.fitted_with('prior_scale'):g} changes a little, {above['likelihood']} when the answers count "
-        f"a little more or less, as they do with another steepness m = {evidence.fitted_with('steepness'):g}.",
-        "A margin that leans on the prior is one whose size the answers leave open: they say which is better, seldom "
-        "by how much. Its sign, which is what the order of trajectories needs, can be sure all the same.",
+        f"Of {total} margins, {above['prior']} are sensitive (at least {limit:g}) to the prior scale σ = "
+        f"{contents.model.prior_scale:g}, and {above['likelihood']} to the likelihood, whose steepness is m = "
+        f"{contents.model.steepness:g}.",
+        "A margin is sensitive to the prior where the answers leave its size open: they say which trajectory is "
+        "better, seldom by how much. Its sign, which fixes the order of the trajectories, can still be certain.",
     ]
-    caption = "Power-scaling sensitivity of each preference's margin; the dashed line is where it begins to matter."
-    alt = f"Sensitivity of {number} margins to prior and likelihood."
+    caption = "Power-scaling sensitivity of each preference's margin; the dashed line is the threshold."
+    alt = f"Sensitivity of {total} margins to prior and likelihood."
     panels = [("", partial(plot_sensitivity, result))]
-    return Section("sensitivity", title, text, [drawn("sensitivity", panels, caption, alt, columns=1, size=(7.6, 3.0))])
+    return text, [drawn("sensitivity", panels, caption, alt, columns=1, size=(7.6, 3.0))]
 
 
-def numbers(iterations: xr.Dataset) -> Section:
+def all_iterations(iterations: xr.Dataset) -> Body:
     """All iterations as one table."""
-    title = "All iterations in figures"
     if not iterations.sizes["iteration"]:
-        return Section("numbers", title, ["None yet."])
-    columns = {
-        "answers": "answers",
-        "value": "value",
-        "kl_bound": "bound",
-        "kl": "KL",
-        "kl_fitted_policy": "KL fitted",
-        "updates": "updates",
-        "temperature": "temperature",
-        "entropy": "entropy",
-        "rhat_max": "R̂",
-        "effective_sample_size_min": "eff. draws",
-        "pairs_satisfied": "agree",
-        "pairs": "of pairs",
-    }
+        return ["No iteration is completed yet."], []
     rows = [
-        [str(int(iterations["iteration"][i])), *(cell(float(iterations[name][i])) for name in columns)]
+        [str(int(iterations["iteration"][i])), *(cell(float(iterations[name][i])) for name in COLUMNS)]
         for i in range(iterations.sizes["iteration"])
     ]
-    return Section("numbers", title, [], [Table("One row an iteration.", ["iteration", *columns.values()], rows)])
+    return [], [Table("One row per iteration.", ["iteration", *COLUMNS.values()], rows)]

@@ -1,4 +1,4 @@
-"""The tables of a report, each an xarray data set: iterations, answers, the utility over the states, trajectories."""
+"""The tables of a report, each an xarray data set: iterations, answers, the utility of states, trajectories."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,46 +7,34 @@ import numpy as np
 import xarray as xr
 from gymnasium.spaces import Discrete
 
+from bayespbrl.diagnostics.estimates import expect_estimate, is_average, of_states, one_setting, sampled
 from bayespbrl.diagnostics.prequential import score_predictions
-from bayespbrl.diagnostics.report.contents import Evidence
-from bayespbrl.diagnostics.report.log import AnswerRecord
+from bayespbrl.diagnostics.report.contents import RunContents
+from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary
 from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws
 from bayespbrl.models.likelihoods import prob
 from bayespbrl.preferences import Answer
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility.averaging import AveragedUtility
 
 MEASURED = (
-    "answers",
-    "pairs",
-    "pairs_satisfied",
-    "value",
-    "kl_bound",
-    "bound_active",
-    "kl",
-    "kl_fitted_policy",
-    "updates",
-    "effective_samples",
-    "temperature",
-    "reps_converged",
-    "entropy",
-    "action_standard_deviation",
-    "rhat_max",
-    "effective_sample_size_min",
-    "utility_converged",
-    "log_evidence",
+    *("answers", "pairs", "pairs_satisfied", "value", "kl_bound", "bound_active", "kl", "kl_fitted_policy", "updates"),
+    *("effective_samples", "temperature", "reps_converged", "entropy", "action_standard_deviation"),
+    *("rhat_max", "effective_sample_size_min", "utility_converged", "log_evidence"),
 )
-# A thousand draws tell a standard deviation to a fortieth of itself.
-DRAWS, CLOUD, RESOLUTION, SHOWN_DRAWS = 1000, 3000, 60, 3
+DRAWS = 1000  # a standard deviation is then known to a fortieth of itself
+SHOWN_DRAWS, SHOWN_STATES, RESOLUTION = 3, 3000, 60
+Variables = dict[str, tuple[str | tuple[str, ...], np.ndarray]]
 
 
-def iterations_table(summaries: Sequence[Mapping[str, Any]]) -> xr.Dataset:
-    """What each completed iteration reported, as float64 along `iteration`; NaN where it said nothing.
+def iterations_table(summaries: Sequence[Summary]) -> xr.Dataset:
+    """The figures of each completed iteration, as float64 along `iteration`; NaN where one is missing.
 
-    A list of numbers is averaged there. What a schedule or the choice of hyper-parameters said becomes variables
+    A list of numbers becomes its mean. What the schedule and the choice of hyperparameters reported becomes variables
     `schedule …` and `hyperparameters …`, texts where they are no numbers.
     """
-    columns: dict[str, Any] = {name: [_number(summary.get(name)) for summary in summaries] for name in MEASURED}
+    columns: dict[str, Sequence[float] | Sequence[str]] = {
+        name: [_number(summary.get(name)) for summary in summaries] for name in MEASURED
+    }
     for group in ("schedule", "hyperparameters"):
         rows = [_flat(summary.get(group)) for summary in summaries]
         for key in dict.fromkeys(key for row in rows for key in row):
@@ -59,66 +47,83 @@ def iterations_table(summaries: Sequence[Mapping[str, Any]]) -> xr.Dataset:
     return xr.Dataset(data, coords={"iteration": np.arange(1, len(summaries) + 1)})
 
 
-def answers_table(evidence: Evidence) -> xr.Dataset:
-    """Every answer, along `answer`, and what was and is expected of it.
+def iterations_without_question(contents: RunContents, iterations: xr.Dataset) -> int:
+    """How many iterations asked no question; one whose questions were all skipped asked."""
+    without_answer = iterations["iteration"].values[1:][np.diff(iterations["answers"].values) == 0]
+    return len(set(without_answer.tolist()) - {answer.iteration for answer in contents.answers})
+
+
+def answers_table(contents: RunContents) -> xr.Dataset:
+    """Every answer, along `answer`, with its probabilities.
 
     Returns:
-      `question`, `iteration`, `first`, `second`, `said`; `before`, the probability of what was said by the estimate
-      that the learner had when it asked; `probability`, the same by the last posterior, which has seen the answer (NaN
-      for a tie or a skip, and for what came after the last estimate that can be read); `margin`, how much higher the
-      last estimate puts the preferred one, and its posterior standard deviation `margin_sd`.
+      `question`, `iteration`, `first`, `second`, `said`, the answer; `before`, its probability by the estimate that the
+      learner had when it asked; `probability`, the same by the last posterior, which has seen the answer (NaN for a tie
+      or a skip, and for answers after the last estimate that can be read); `margin`, the utility of the preferred one
+      less that of the other by the last estimate, and its posterior standard deviation `margin_sd`.
     """
-    records, tree = evidence.answers, evidence.posterior
-    number = len(records)
+    answers = contents.answers
     names = ("before", "probability", "margin", "margin_sd")
-    columns = {name: np.full(number, np.nan) for name in names}
-    known = 0 if evidence.estimate is None else evidence.estimate.quality.pairs
-    for k, record in enumerate(records):
-        if record.row is None:
+    columns = {name: np.full(len(answers), np.nan) for name in names}
+    fitted = 0 if contents.estimate is None else contents.estimate.quality.pairs
+    for k, answer in enumerate(answers):
+        if answer.row is None:
             continue
-        columns["before"][k] = record.predicted if record.answer is Answer.FIRST else 1 - record.predicted
-        if record.row >= known:
-            continue
-        if isinstance(evidence.estimate, AveragedUtility):
-            if (both := _preferred_and_dominated(evidence, record)) is not None:
-                margins = evidence.estimate.margin_draws(*both)
-                columns["probability"][k] = np.mean(prob(evidence.estimate.likelihood, margins))
-                columns["margin"][k], columns["margin_sd"][k] = margins.mean(), margins.std()
-        elif tree is not None:
-            margins = np.asarray(tree["posterior"]["margins"])[:, :, record.row]
-            log_likelihood = np.asarray(tree["log_likelihood"]["answers"])[:, :, record.row]
-            columns["probability"][k] = np.mean(np.exp(log_likelihood))
-            columns["margin"][k], columns["margin_sd"][k] = margins.mean(), margins.std()
-        else:
-            columns["margin"][k] = _margin(evidence, record)
-    data: dict[str, Any] = {name: [getattr(r, name) for r in records] for name in ("question", "iteration")}
-    data |= {name: [getattr(r, name) for r in records] for name in ("first", "second")}
-    data["said"] = np.array([str(r.answer) for r in records], dtype=np.str_)
-    return xr.Dataset({name: ("answer", np.asarray(values)) for name, values in (data | columns).items()})
+        columns["before"][k] = answer.predicted if answer.answer is Answer.FIRST else 1 - answer.predicted
+        if answer.row < fitted:
+            columns["probability"][k], columns["margin"][k], columns["margin_sd"][k] = _by_last_estimate(
+                contents, answer
+            )
+    data: Variables = {
+        name: ("answer", np.asarray([getattr(answer, name) for answer in answers]))
+        for name in ("question", "iteration", "first", "second")
+    }
+    data["said"] = ("answer", np.array([str(answer.answer) for answer in answers], dtype=np.str_))
+    return xr.Dataset(data | {name: ("answer", values) for name, values in columns.items()})
 
 
-def prequential_table(evidence: Evidence) -> xr.Dataset:
+def _by_last_estimate(contents: RunContents, answer: AnsweredQuestion) -> tuple[float, float, float]:
+    """Probability of an answer that the estimate was fitted to, its margin and the margin's standard deviation.
+
+    NaN where these are unknown: without a posterior, or where a trajectory or its features are missing.
+    """
+    estimate, tree = contents.estimate, contents.posterior
+    both = _preferred_and_dominated(contents, answer)
+    if tree is not None and not is_average(estimate):
+        margins = np.asarray(tree["posterior"]["margins"])[:, :, answer.row]
+        probability = np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row]))
+    elif both is None or estimate is None:
+        return np.nan, np.nan, np.nan
+    elif tree is None:
+        preferred, dominated = estimate.trajectory_utilities(both)
+        return np.nan, float(preferred - dominated), np.nan
+    else:
+        margins = estimate.margin_draws(*both)
+        probability = np.mean(prob(estimate.likelihood, margins))
+    return float(probability), float(margins.mean()), float(margins.std())
+
+
+def prequential_table(contents: RunContents) -> xr.Dataset:
     """Scores and reliability curve of the predictions that the learner made of the answers, before each was given.
 
-    As of `score_predictions`; ties, skips and what could not be predicted are left out.
+    As of `score_predictions`, without ties, skips and answers that could not be predicted.
     """
-    scored = [r for r in evidence.answers if r.row is not None and np.isfinite(r.predicted)]
-    predicted = np.array([record.predicted for record in scored])
-    observed = np.array([record.answer is Answer.FIRST for record in scored], dtype=bool)
+    scored = [a for a in contents.answers if a.row is not None and np.isfinite(a.predicted)]
+    predicted = np.array([answer.predicted for answer in scored])
+    observed = np.array([answer.answer is Answer.FIRST for answer in scored], dtype=bool)
     return score_predictions(np.clip(predicted, 0, 1), observed)
 
 
-def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
+def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
     """The utility over the state space.
 
     Returns:
-      along `state`: `used`, what the learner took for the utility (of an `AveragedUtility` the average, and all else
-      of its likeliest setting); where there is a posterior, its `mean` and `sd`,
-      `prior_sd`, and `draws` (draw, state), three of them; all in the units of the weights; `states`, the observations;
-      `visits`, how often each was seen (discrete states); `reached`, whether φ is more than next to nothing there, as
-      it is not far from every centre.
+      along `state`: `used`, the utility that the learner used (of an average the average, while all else is of its
+      sampled setting); where there is a posterior, its `mean` and `sd`, `prior_sd`, and `draws` (draw, state), three of
+      them; all in the units of the weights; `states`, the observations; `visits`, how often each was seen (discrete
+      states); `reached`, whether φ is more than a hundredth of its largest length, as it is near some centre.
 
-      The attribute `kind` says what the states are: `grid` (the cells, row by row, of an environment that has a
+      The attribute `kind` says what the states are: `grid` (the cells, row by row, of an environment with a
       `grid_shape`), `list` (discrete), `line` and `plane` (evenly spaced over what was observed in one or two
       dimensions) or `cloud` (observed states; `dimensions` are the two that they fill best). `shape` is that of a grid
       or plane.
@@ -126,151 +131,139 @@ def utility_table(evidence: Evidence, *, seed: int = 0) -> xr.Dataset:
     Raises:
       ValueError: no estimate, or features that were not passed again; no trajectory that can be read.
     """
-    estimate, states = evidence.estimate, _observed(evidence)
-    if not hasattr(estimate, "utilities"):
+    estimate, states = contents.estimate, _observed(contents)
+    if not of_states(estimate):
         raise ValueError("utility: expected an estimate of the utility of states, got none")
-    shown, attrs = _states_to_show(evidence, states, np.random.default_rng(seed))
-    features = estimate.features(shown)
+    shown, attrs = _states_to_show(contents, states, np.random.default_rng(seed))
+    features = one_setting(estimate).features(shown)
     lengths = np.linalg.norm(features, axis=1)
-    data: dict[str, Any] = {"used": ("state", estimate.utilities(shown))}
+    data: Variables = {"used": ("state", estimate.utilities(shown))}
     data["reached"] = ("state", lengths > 0.01 * np.max(lengths, initial=0.0))
     data["states"] = (("state",) if shown.ndim == 1 else ("state", "observation"), shown)
     if states.ndim == 1:
         data["visits"] = ("state", np.bincount(states, minlength=len(shown)))
-    if evidence.posterior is not None:
-        draws = estimate.draws(features, number=DRAWS).reshape(-1, len(shown))
+    if (fit := sampled(estimate)) is not None:
+        draws = fit.draws(features, number=DRAWS).reshape(-1, len(shown))
         chosen = np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)
-        mean = np.asarray(evidence.posterior["utility_weights_mean"]) / estimate.scale
+        mean = np.asarray(fit.posterior["utility_weights_mean"]) / fit.scale
         data["mean"], data["sd"] = ("state", features @ mean), ("state", draws.std(axis=0))
         data["draws"] = (("draw", "state"), draws[chosen])
-        scale = float(evidence.posterior.attrs["prior_scale"]) / estimate.scale
+        scale = float(fit.posterior.attrs["prior_scale"]) / fit.scale
         data["prior_sd"] = ("state", scale * lengths)
     return xr.Dataset(data, attrs=attrs)
 
 
-def trajectories_table(evidence: Evidence) -> xr.Dataset:
-    """Each trajectory that was asked about, along `trajectory` (their numbers): `utility`, its 90 % interval `lower`,
-    `upper` where there is a posterior, and `hidden_return`, which the learner never sees.
+def trajectories_table(contents: RunContents) -> xr.Dataset:
+    """Each trajectory that a question showed, along `trajectory` (their numbers).
+
+    Returns:
+      `utility`, its 90 % interval `lower`, `upper` where there is a posterior, and `hidden_return`, which the learner
+      never sees.
 
     Raises:
       ValueError: no estimate, or features that were not passed again.
     """
-    estimate = _estimate(evidence)
-    asked = {number for record in evidence.answers for number in (record.first, record.second)}
-    numbers = sorted(asked & set(evidence.trajectories))
-    shown = [evidence.trajectories[number] for number in numbers]
-    data: dict[str, Any] = {"hidden_return": ("trajectory", np.array([t.total_reward for t in shown]))}
+    estimate = expect_estimate(contents.estimate)
+    asked = {number for answer in contents.answers for number in (answer.first, answer.second)}
+    numbers = sorted(asked & set(contents.trajectories))
+    shown = [contents.trajectories[number] for number in numbers]
+    data: Variables = {"hidden_return": ("trajectory", np.array([t.total_reward for t in shown]))}
     data["utility"] = ("trajectory", estimate.trajectory_utilities(shown) if shown else np.zeros(0))
-    if evidence.posterior is not None and shown:
+    if contents.posterior is not None and shown:
         data |= _interval(estimate.trajectory_draws(shown, number=DRAWS), "trajectory")
     return xr.Dataset(data, coords={"trajectory": numbers})
 
 
-def progress_table(evidence: Evidence) -> xr.Dataset:
-    """What the last estimate thinks of each iteration's trajectories, along `iteration`: a learning curve that needs no
-    reward.
+def progress_table(contents: RunContents) -> xr.Dataset:
+    """Utility of each iteration's trajectories by the last estimate: a learning curve that needs no reward.
 
     Returns:
-      `utility`, the mean over the iteration's trajectories less that of the last, and where there is a posterior
+      along `iteration`: `utility`, the mean over its trajectories less that of the last, and where there is a posterior
       `lower` and `upper`, the 90 % interval of that difference; only iterations whose trajectories can all be read.
 
     Raises:
       ValueError: no estimate; features that were not passed again.
     """
-    estimate, size = _estimate(evidence), evidence.settings.trajectories_per_iteration
-    numbers = sorted(evidence.trajectories)  # of whole iterations, for the file of one is read or is not
-    shown = [evidence.trajectories[number] for number in numbers]
+    estimate, size = expect_estimate(contents.estimate), contents.settings.rollouts.trajectories_per_iteration
+    numbers = sorted(contents.trajectories)  # of whole iterations: the file of one is read or is not
+    shown = [contents.trajectories[number] for number in numbers]
 
-    def over_the_last(utilities: np.ndarray) -> np.ndarray:
+    def relative_to_last(utilities: np.ndarray) -> np.ndarray:
         means = utilities.reshape(*utilities.shape[:-1], -1, size).mean(axis=-1)
         return means - means[..., -1:]
 
-    data: dict[str, Any] = {"utility": ("iteration", over_the_last(estimate.trajectory_utilities(shown)))}
-    if evidence.posterior is not None:
-        data |= _interval(over_the_last(estimate.trajectory_draws(shown, number=DRAWS)), "iteration")
+    data: Variables = {"utility": ("iteration", relative_to_last(estimate.trajectory_utilities(shown)))}
+    if contents.posterior is not None:
+        data |= _interval(relative_to_last(estimate.trajectory_draws(shown, number=DRAWS)), "iteration")
     return xr.Dataset(data, coords={"iteration": [number // size + 1 for number in numbers[::size]]})
 
 
-def ranking_table(evidence: Evidence) -> xr.Dataset:
-    """What the posterior says about the order of the newest iteration's trajectories and the undominated one.
+def ranking_table(contents: RunContents) -> xr.Dataset:
+    """Posterior probabilities of the order of the newest iteration's trajectories and the undominated one.
 
-    As of `ranking_probabilities`, with their numbers along `trajectory`; none of them without features or posterior.
+    As of `ranking_probabilities`, with their numbers along `trajectory`; empty without features or posterior.
     """
-    size = evidence.settings.trajectories_per_iteration
-    newest = [n for n in sorted(evidence.trajectories) if n >= (evidence.estimate_iteration - 1) * size][:size]
-    best = [n for n in evidence.preferences.undominated[-1:] if n in evidence.trajectories]
-    numbers = sorted({*newest, *best}) if evidence.posterior is not None and not evidence.features_missing else []
+    size = contents.settings.rollouts.trajectories_per_iteration
+    newest = [n for n in sorted(contents.trajectories) if n >= (contents.estimate_iteration - 1) * size][:size]
+    best = [n for n in contents.preferences.undominated[-1:] if n in contents.trajectories]
+    numbers = sorted({*newest, *best}) if contents.posterior is not None and not contents.features_missing else []
     if not numbers:
         return xr.Dataset(coords={"trajectory": np.zeros(0, dtype=np.int64)})
-    draws = return_draws(evidence.estimate, [evidence.trajectories[n] for n in numbers], number=DRAWS)
+    draws = return_draws(contents.estimate, [contents.trajectories[n] for n in numbers], number=DRAWS)
     return ranking_probabilities(draws.assign_coords(trajectory=numbers))
 
 
-def _estimate(evidence: Evidence) -> Any:
-    """The estimate of a run that has one; a `ValueError` otherwise."""
-    if not hasattr(evidence.estimate, "trajectory_utilities"):
-        raise ValueError("utility: expected an estimate, got none")
-    return evidence.estimate
-
-
-def _interval(draws: np.ndarray, dimension: str) -> dict[str, Any]:
+def _interval(draws: np.ndarray, dimension: str) -> Variables:
     """`lower` and `upper`, the ends of the interval that holds 90 % of the draws, (S, n), along `dimension`."""
     lower, upper = np.quantile(draws, [0.05, 0.95], axis=0)
     return {"lower": (dimension, lower), "upper": (dimension, upper)}
 
 
 def _states_to_show(
-    evidence: Evidence, states: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, dict[str, Any]]:
+    contents: RunContents, states: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[str, str | tuple[int, ...]]]:
     if states.ndim == 1:
-        space = getattr(evidence.environment, "observation_space", None)
+        space = None if contents.environment is None else contents.environment.observation_space
         number = int(space.n) if isinstance(space, Discrete) else int(states.max()) + 1
-        shape = getattr(evidence.dynamics, "grid_shape", None)
-        kind = {"kind": "list"} if shape is None else {"kind": "grid", "shape": tuple(shape)}
-        return np.arange(number), kind
+        shape = contents.environment_attribute("grid_shape")
+        return np.arange(number), {"kind": "list"} if shape is None else {"kind": "grid", "shape": tuple(shape)}
     if states.shape[1] <= 2:
         lines = [np.linspace(low, high, RESOLUTION) for low, high in zip(states.min(0), states.max(0), strict=True)]
-        grid = np.meshgrid(*lines)
-        kind = {"kind": "line"} if len(lines) == 1 else {"kind": "plane", "shape": (RESOLUTION, RESOLUTION)}
-        return np.stack([axis.ravel() for axis in grid], axis=1), kind
+        grid = np.stack([axis.ravel() for axis in np.meshgrid(*lines)], axis=1)
+        return grid, {"kind": "line"} if len(lines) == 1 else {"kind": "plane", "shape": (RESOLUTION, RESOLUTION)}
     spread = np.quantile(states, 0.9, axis=0) - np.quantile(states, 0.1, axis=0)
     whole = np.ptp(states, axis=0)
     filled = np.divide(spread, whole, out=np.zeros(len(whole)), where=whole > 0)
     dimensions = np.sort(np.argsort(-filled, kind="stable")[:2])
-    chosen = rng.choice(len(states), size=min(CLOUD, len(states)), replace=False)
+    chosen = rng.choice(len(states), size=min(SHOWN_STATES, len(states)), replace=False)
     return states[chosen], {"kind": "cloud", "dimensions": tuple(int(d) for d in dimensions)}
 
 
-def _observed(evidence: Evidence) -> np.ndarray:
-    if not evidence.trajectories:
+def _observed(contents: RunContents) -> np.ndarray:
+    if not contents.trajectories:
         raise ValueError("trajectories: expected at least one that can be read, got none")
-    return np.concatenate([trajectory.states for trajectory in evidence.trajectories.values()])
+    return np.concatenate([trajectory.states for trajectory in contents.trajectories.values()])
 
 
-def _margin(evidence: Evidence, record: AnswerRecord) -> float:
-    """By an estimate without draws, in its own units; NaN where a trajectory or its features are missing."""
-    both = _preferred_and_dominated(evidence, record)
-    if both is None:
-        return float("nan")
-    preferred, dominated = evidence.estimate.trajectory_utilities(both)
-    return float(preferred - dominated)
+def _preferred_and_dominated(contents: RunContents, answer: AnsweredQuestion) -> tuple[Trajectory, Trajectory] | None:
+    """The two trajectories of an answer; None where one of them, or the features, are missing."""
+    preferred, dominated = answer.first, answer.second
+    if answer.answer is not Answer.FIRST:
+        preferred, dominated = dominated, preferred
+    known = contents.trajectories
+    if contents.features_missing or preferred not in known or dominated not in known:
+        return None
+    return known[preferred], known[dominated]
 
 
-def _preferred_and_dominated(evidence: Evidence, record: AnswerRecord) -> list[Trajectory] | None:
-    """The two that an answer was about; None where one, or what their utility rests on, is missing."""
-    numbers = (record.first, record.second) if record.answer is Answer.FIRST else (record.second, record.first)
-    both = [evidence.trajectories[number] for number in numbers if number in evidence.trajectories]
-    return None if len(both) < 2 or evidence.features_missing else both
-
-
-def _number(value: Any) -> float:
+def _number(value: object) -> float:
     if isinstance(value, list) and value:
         return float(np.mean([_number(entry) for entry in value]))
     return float(value) if isinstance(value, int | float) else float("nan")
 
 
-def _flat(value: Any) -> dict[str, Any]:
-    """A mapping with mappings and lists within it joined on: {"a": {"b": 1}, "c": [2]} as {"a b": 1, "c 0": 2}."""
+def _flat(value: object) -> dict[str, Any]:
+    """Nested mappings and lists as one mapping: {"a": {"b": 1}, "c": [2]} as {"a b": 1, "c 0": 2}."""
     if not isinstance(value, Mapping):
         return {}
     flat: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""The section of a report on the utility: over the states with its uncertainty, and of what was compared."""
+"""The section of a report on the utility: over the states with its uncertainty, and of the compared trajectories."""
 
 from functools import partial
 from typing import Any
@@ -6,108 +6,120 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from bayespbrl.diagnostics.estimates import is_average, of_states
 from bayespbrl.diagnostics.report import figures
-from bayespbrl.diagnostics.report.contents import Evidence
-from bayespbrl.diagnostics.report.document import Picture, Section, drawn
-from bayespbrl.diagnostics.report.summary import no_posterior, percent
+from bayespbrl.diagnostics.report.contents import RunContents
+from bayespbrl.diagnostics.report.document import Block, Body, Picture, drawn
+from bayespbrl.diagnostics.report.formatting import percent
 from bayespbrl.diagnostics.report.tables import trajectories_table, utility_table
 from bayespbrl.diagnostics.uncertainty import plot_ranking
-from bayespbrl.utility.averaging import AveragedUtility
+
+PLACES = {
+    "grid": "over the cells of the grid",
+    "list": "of every state",
+    "line": "over the observed range",
+    "plane": "over the observed range",
+    "cloud": "at observed states, in the two dimensions that they fill best",
+}
 
 
-def utility(evidence: Evidence, ranking: xr.Dataset) -> Section:
-    """The utility with its uncertainty over the states, and of the trajectories that were compared."""
-    title = "What it thinks is good"
-    if evidence.estimate is None:
-        return Section("utility", title, ["No utility estimate yet."])
-    if evidence.features_missing:
-        return Section("utility", title, [f"The features φ are a function of your own: {evidence.features_missing}."])
-    blocks: list[Any] = []
-    text = [] if evidence.posterior is not None else [no_posterior(evidence)]
-    if isinstance(evidence.estimate, AveragedUtility):
-        likeliest = percent(evidence.estimate.probabilities.max())
+def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
+    """The utility with its uncertainty over the states, and of the compared trajectories."""
+    estimate = contents.estimate
+    if estimate is None:
+        return ["No utility estimate yet."], []
+    if contents.features_missing:
+        return [f"The features φ are a function of your own, and {contents.features_missing}."], []
+    blocks: list[Block] = []
+    text = [] if contents.posterior is not None else [contents.posterior_missing]
+    if is_average(estimate):
         text.append(
-            f"The learner acted on an average over {len(evidence.estimate.probabilities)} choices of length scales, "
-            f"the likeliest of probability {likeliest}. The trajectories below are ordered by that average, and it "
-            "gives the answers their probabilities; mean, deviation and draws over the states, and all that is said of "
-            "convergence, influence and sensitivity, are of the one setting whose posterior was sampled."
+            f"The learner acted on an average over {len(estimate.probabilities)} choices of length scales; the most "
+            f"probable has probability {percent(estimate.probabilities.max())}. The average orders the trajectories "
+            "below and gives the answers their probabilities. The mean, the deviation and the draws over the states, "
+            "the convergence and the sensitivity are those of the one setting whose posterior was sampled."
         )
-    if hasattr(evidence.estimate, "utilities"):
-        table = utility_table(evidence)
+    if of_states(estimate):
+        table = utility_table(contents)
         blocks += _maps(table)
-        if "sd" in table:
-            inside = table["reached"].values
-            left = table["sd"].values[inside] / table["prior_sd"].values[inside]
-            text.append(
-                f"Of the prior's standard deviation {percent(np.median(left))} is left in the median over the states "
-                f"shown, and {percent(left.min())} where most was learnt: answers tell whole trajectories apart, and "
-                "say less of single states."
-            )
-    compared = trajectories_table(evidence)
+        text += _remaining_uncertainty(table)
+    compared = trajectories_table(contents)
     if compared.sizes["trajectory"] and np.ptp(compared["hidden_return"].values) > 0:
-        caption = (
-            "Every trajectory that was asked about. A rising cloud says that the utility orders trajectories as the "
-            "hidden return does. The scale is free."
-        )
-        if "lower" in compared:
-            caption += " The interval is the posterior's for the utility of the whole."
-        panels = [("Trajectories", partial(figures.plot_trajectories, compared))]
-        alt = f"Inferred utility against hidden return of {compared.sizes['trajectory']} trajectories."
-        blocks.append(drawn("trajectories", panels, caption, alt, columns=1, size=(6.0, 3.3)))
+        blocks.append(_trajectories(compared))
     if ranking.sizes["trajectory"] > 1:
         caption = (
-            "The newest trajectories and the undominated one: the probability of each rank, rank 1 the best. A sharp "
-            "diagonal is an order that is known; columns of one shade are one that is not."
+            "Probability of each rank of the newest trajectories and the undominated one; rank 1 is the best. A sharp "
+            "diagonal is a certain order; a column of one shade is an unknown one."
         )
-        panels = [("Ranking", partial(plot_ranking, ranking))]
         alt = f"Probabilities of the ranks of {ranking.sizes['trajectory']} trajectories."
+        panels = [("Ranking", partial(plot_ranking, ranking))]
         blocks.append(drawn("ranking", panels, caption, alt, columns=1, size=(6.0, 3.6)))
-    return Section("utility", title, text, blocks)
+    return text, blocks
+
+
+def _remaining_uncertainty(table: xr.Dataset) -> list[str]:
+    if "sd" not in table:
+        return []
+    inside = table["reached"].values
+    left = table["sd"].values[inside] / table["prior_sd"].values[inside]
+    return [
+        f"The posterior standard deviation is {percent(np.median(left))} of the prior's in the median over the states "
+        f"shown, and {percent(left.min())} where most was learnt. Answers distinguish whole trajectories, and say less "
+        "about single states."
+    ]
+
+
+def _trajectories(compared: xr.Dataset) -> Picture:
+    caption = (
+        "Every trajectory that a question showed. A rising cloud means that the utility orders the trajectories as the "
+        "hidden return does. The scale is arbitrary."
+    )
+    if "lower" in compared:
+        caption += " The intervals are the posterior's, for the utility of the whole trajectory."
+    alt = f"Inferred utility against hidden return of {compared.sizes['trajectory']} trajectories."
+    panels = [("Trajectories", partial(figures.plot_trajectories, compared))]
+    return drawn("trajectories", panels, caption, alt, columns=1, size=(6.0, 3.3))
 
 
 def _maps(table: xr.Dataset) -> list[Picture]:
-    kind = table.attrs["kind"]
-    where = {
-        "grid": "over the cells of the grid",
-        "list": "of every state",
-        "line": "along what was observed",
-        "plane": "over the range of what was observed",
-        "cloud": "at observed states, along the two dimensions that they fill best",
-    }[kind]
-    if kind in ("list", "line"):
-        panels: list[Any] = [("Utility of the states", partial(figures.plot_state_bands, table))]
-        caption = f"Utility {where}: mean, and two posterior standard deviations either way. The scale is free."
-        return [drawn("utility", panels, caption, f"Utility {where}.", columns=1, size=(7.6, 3.2))]
+    where = PLACES[table.attrs["kind"]]
+    if table.attrs["kind"] in ("list", "line"):
+        bands = [("Utility of the states", partial(figures.plot_state_bands, table))]
+        caption = f"Utility {where}: posterior mean ± two standard deviations. The scale is arbitrary."
+        return [drawn("utility", bands, caption, f"Utility {where}.", columns=1, size=(7.6, 3.2))]
     blank = np.where(table["reached"].values, 0.0, np.nan)
-    shown = [("used", "As the learner used it", "utility", "viridis")]
-    caption = f"The utility {where}. The scale is free."
+    used = ("used", "Utility that the learner used", "utility", "viridis")
+    shown, caption = [used], f"The utility {where}. The scale is arbitrary."
     if "sd" in table:
         table = table.assign(left=table["sd"] / table["prior_sd"].where(table["reached"]))
         shown = [("mean", "Mean", "utility", "viridis"), ("sd", "Standard deviation", "sd", "magma")]
-        shown += [("left", "Share of the prior left", "sd / prior sd", "magma")]
+        shown.append(("left", "Remaining uncertainty", "sd / prior sd", "magma"))
         caption = (
-            f"The utility {where}: its posterior mean; its standard deviation, which is small also where the features "
-            "are; and how much of the prior's is left, dark where something was learnt. The scale is free."
+            f"The utility {where}: its posterior mean; its standard deviation, which is also small where the features "
+            "are small; and the standard deviation as a share of the prior's, dark where something was learnt. The "
+            "scale is arbitrary."
         )
         if not np.array_equal(table["used"], table["mean"]):
-            shown.append(("used", "As the learner used it", "utility", "viridis"))
-            caption += " The learner acted on the fourth."
+            shown.append(used)
+            caption += " The learner acted on the fourth map."
     if np.isnan(blank).any():
-        caption += " Grey: too far from every centre of the features for the utility to be anything but zero."
+        caption += " Grey: so far from every centre of the features that the utility is nearly zero."
     panels = [
         (title, partial(figures.plot_states, table, table[name].values + blank, label=label, cmap=colours))
         for name, title, label, colours in shown
     ]
     columns = 2 if len(panels) == 4 else 3
-    blocks = [drawn("utility", panels, caption, f"Map of the utility {where}.", columns=columns, size=(3.5, 2.9))]
-    if "draws" in table:
-        draws = table["draws"].values
-        limits: dict[str, Any] = {"vmin": float(draws.min()), "vmax": float(draws.max()), "cmap": "viridis"}
-        panels = [
-            (f"Draw {i + 1}", partial(figures.plot_states, table, draw + blank, label="utility", **limits))
-            for i, draw in enumerate(draws)
-        ]
-        caption = "Three draws of the posterior on one scale: each explains the answers. What they share is known."
-        alt = f"Three posterior draws of the utility {where}."
-        blocks.append(drawn("draws", panels, caption, alt, columns=3, size=(3.5, 2.9)))
-    return blocks
+    maps = [drawn("utility", panels, caption, f"Map of the utility {where}.", columns=columns, size=(3.5, 2.9))]
+    return maps + ([_draws(table, blank, where)] if "draws" in table else [])
+
+
+def _draws(table: xr.Dataset, blank: np.ndarray, where: str) -> Picture:
+    draws = table["draws"].values
+    limits: dict[str, Any] = {"vmin": float(draws.min()), "vmax": float(draws.max()), "cmap": "viridis"}
+    panels = [
+        (f"Draw {i + 1}", partial(figures.plot_states, table, draw + blank, label="utility", **limits))
+        for i, draw in enumerate(draws)
+    ]
+    caption = "Three posterior draws on one scale. Each explains the answers; what they have in common is known."
+    alt = f"Three posterior draws of the utility {where}."
+    return drawn("draws", panels, caption, alt, columns=3, size=(3.5, 2.9))

@@ -1,4 +1,4 @@
-"""The diagnostic report of a run: one self-contained file that a person reads from top to bottom."""
+"""The diagnostic report of a run: read the run, assemble the report, write it as one file."""
 
 from collections.abc import Callable
 from datetime import datetime
@@ -7,138 +7,140 @@ from importlib.resources import files
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
+import gymnasium
+from gymnasium.experimental.functional import FuncEnv
 from jinja2 import Environment, StrictUndefined
 
-from bayespbrl.diagnostics.report import answers, sections, summary, tables, utility, warnings
-from bayespbrl.diagnostics.report.contents import Evidence, read_evidence
-from bayespbrl.diagnostics.report.document import Comparison, Picture, Section
+from bayespbrl import checks
+from bayespbrl.diagnostics.report import answers, sections, tables, utility
+from bayespbrl.diagnostics.report.contents import RunContents, read_contents
+from bayespbrl.diagnostics.report.document import Body, Comparison, Picture, Report, ReportWarning, Section
+from bayespbrl.diagnostics.report.summary import summary
+from bayespbrl.diagnostics.report.warnings import find_warnings
+from bayespbrl.features import StateFeatures
+from bayespbrl.runs.files import write_file
 
-FORMATS = ("html", "md")
 
-
-def write_report(directory: Path | str, *, format: str = "html", env: Any = None, features: Any = None) -> Path:
-    """Write the report of a run into its directory; nothing else there is changed.
+def write_report(
+    directory: Path | str,
+    *,
+    format: str = "html",
+    env: gymnasium.Env | FuncEnv | None = None,
+    features: StateFeatures | None = None,
+) -> Path:
+    """Write the report of a run into its directory, without changing anything else there.
 
     Args:
-      directory: of a run: finished, in progress, or with files that cannot be read, which the report then says.
+      directory: of a run: finished, in progress, or with files that cannot be read, which the report then names.
       format: `html`, one file with its pictures in it, `report.html`; or `md`, `report.md` with its pictures in
         `report_files/`.
-      env, features: what the run was started with, where these were objects of the user's; what needs them is left out,
-        and said to be, without them.
+      env, features: the objects that the run was started with, where these were your own. Without them the report
+        leaves out what needs them, and says so.
 
     Returns:
       the path of the file.
 
     Raises:
-      ValueError: a format there is not; a directory that is no run, is one of a newer version, or cannot be written.
+      ValueError: an unknown format; a directory that is no run, is one of a newer version, or cannot be written.
     """
-    if format not in FORMATS:
-        raise ValueError(f"format: expected {' or '.join(FORMATS)}, got {format!r}")
-    content = assembled(read_evidence(directory, env=env, features=features))
-    template = (
-        files("bayespbrl.diagnostics.report")
-        .joinpath("templates", f"report.{format}.jinja")
-        .read_text(encoding="utf-8")
-    )
-    # what comes from a run (names, messages) is text and never markup
-    engine = Environment(autoescape=format == "html", undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    engine.filters["groupby_adjacent"] = lambda blocks: [
-        (kind, list(group)) for kind, group in groupby(blocks, key=attrgetter("kind"))
-    ]
-    engine.filters["cell"] = lambda text: str(text).replace("|", "\\|").replace("\n", " ")
+    checks.one_of("format", format, ("html", "md"))
+    report = assembled(read_contents(directory, env=env, features=features))
     path = Path(directory) / f"report.{format}"
     try:
         if format == "md":
-            _write_pictures(Path(directory) / "report_files", content["sections"])
-        aside = path.with_name(path.name + ".part")
-        aside.write_text(engine.from_string(template).render(**content), encoding="utf-8")
-        aside.replace(path)
+            _write_pictures(Path(directory) / "report_files", report)
+        write_file(path, _rendered(report, format))
     except OSError as error:
         raise ValueError(f"{path}: cannot write the report there ({error})") from error
     return path
 
 
-def assembled(evidence: Evidence) -> dict[str, Any]:
-    """Everything that the templates name: facts, sentences, warnings and sections."""
-    iterations = tables.iterations_table(evidence.iterations)
-    answered = tables.answers_table(evidence)
-    scores, ranking = tables.prequential_table(evidence), tables.ranking_table(evidence)
-    failures: list[warnings.Caution] = []
-    parts: list[tuple[str, Callable[[], Section]]] = [
-        ("Learning curve", lambda: sections.learning(evidence, iterations)),
-        ("Have the fits converged?", lambda: sections.fits(evidence, iterations)),
-        ("What it thinks is good", lambda: utility.utility(evidence, ranking)),
-        ("The answers", lambda: answers.answers(evidence, answered)),
-        ("Are its probabilities right?", lambda: sections.calibration(evidence, scores)),
-        ("The policy updates", lambda: sections.updates(evidence, iterations)),
-        ("How much leans on σ and m", lambda: sections.leaning(evidence)),
-        ("All iterations in figures", lambda: sections.numbers(iterations)),
+def _rendered(report: Report, format: str) -> str:
+    template = files("bayespbrl.diagnostics.report") / "templates" / f"report.{format}.jinja"
+    # names and messages of a run are text, never markup
+    engine = Environment(autoescape=format == "html", undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    engine.filters["groupby_adjacent"] = lambda blocks: [
+        (kind, list(group)) for kind, group in groupby(blocks, key=attrgetter("kind"))
     ]
-    made = [_built(title, build, failures) for title, build in parts]
-    return {
-        "title": f"{evidence.settings.env}, {evidence.settings.utility}, seed {evidence.settings.seed}",
-        "state": _state(evidence),
-        "facts": _facts(evidence),
-        "learnt": summary.learnt(evidence, iterations, answered, scores, ranking),
-        "warnings": warnings.warnings(evidence, iterations, answered, scores) + failures,
-        "sections": made,
-        "made": f"Made by bayespbrl {version('bayespbrl')} on {datetime.now():%Y-%m-%d %H:%M} from {evidence.path}.",
-    }
+    engine.filters["cell"] = lambda text: str(text).replace("|", "\\|").replace("\n", " ")
+    return engine.from_string(template.read_text(encoding="utf-8")).render(vars(report))
 
 
-def _built(title: str, build: Callable[[], Section], failures: list[warnings.Caution]) -> Section:
-    """A section, or one that says why it could not be made: whatever an environment or features of the user's raise."""
+def _write_pictures(folder: Path, report: Report) -> None:
+    folder.mkdir(exist_ok=True)
+    for block in (block for section in report.sections for block in section.blocks):
+        pictures = block.pictures if isinstance(block, Comparison) else (block,) if isinstance(block, Picture) else ()
+        for picture in pictures:
+            write_file(folder / f"{picture.name}.png", picture.png)
+
+
+def assembled(contents: RunContents) -> Report:
+    """The report: facts, summary, warnings and sections."""
+    iterations = tables.iterations_table(contents.iterations)
+    answered = tables.answers_table(contents)
+    scores, ranking = tables.prequential_table(contents), tables.ranking_table(contents)
+    parts: list[tuple[str, str, Callable[[], Body]]] = [
+        ("learning", "Learning curve", lambda: sections.learning_curve(contents, iterations)),
+        ("convergence", "Convergence of the posterior", lambda: sections.convergence_of_fits(contents, iterations)),
+        ("utility", "Inferred utility", lambda: utility.utility(contents, ranking)),
+        ("answers", "Answers, most surprising first", lambda: answers.answers(contents, answered)),
+        ("calibration", "Calibration of the predictions", lambda: sections.calibration(contents, scores)),
+        ("updates", "Policy updates", lambda: sections.updates(iterations)),
+        ("sensitivity", "Sensitivity to σ and m", lambda: sections.sensitivity_to_model(contents)),
+        ("iterations", "All iterations", lambda: sections.all_iterations(iterations)),
+    ]
+    failures: list[ReportWarning] = []
+    settings = contents.settings
+    return Report(
+        title=f"{settings.env}, {settings.estimation.utility}, seed {settings.seed}",
+        state=_state(contents),
+        facts=_facts(contents),
+        sections=[_section(name, title, build, failures) for name, title, build in parts],
+        summary=summary(contents, iterations, answered, scores, ranking),
+        warnings=find_warnings(contents, iterations, answered, scores) + failures,
+        made=f"Made by bayespbrl {version('bayespbrl')} on {datetime.now():%Y-%m-%d %H:%M} from {contents.path}.",
+    )
+
+
+def _section(name: str, title: str, build: Callable[[], Body], failures: list[ReportWarning]) -> Section:
+    """A section, or one that says why it could not be made: the user's environment or features may raise anything."""
     try:
-        return build()
+        return Section(name, title, *build())
     except Exception as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        failures.append(
-            warnings.Caution(f"The section “{title}” could not be made ({reason}).", "The others are unaffected.")
-        )
-        name = "".join(letter for letter in title.lower() if letter.isalpha())
-        return Section(name, title, [f"This section could not be made: {reason}."])
+        what = f"The section “{title}” could not be made ({reason})."
+        failures.append(ReportWarning(what, "The other sections are unaffected."))
+        return Section(name, title, [f"This section could not be made: {reason}."], [])
 
 
-def _state(evidence: Evidence) -> str:
-    done, wanted = len(evidence.iterations), evidence.settings.iterations
-    if evidence.finished:
+def _state(contents: RunContents) -> str:
+    done, wanted = len(contents.iterations), contents.settings.iterations
+    if contents.finished:
         return f"Finished: {done} iterations."
-    waiting = "" if evidence.waiting is None else f" Question {evidence.waiting} waits for an answer."
-    text = f"In progress: {done} of {wanted} iterations.{waiting} "
-    if evidence.settings.own_parts:
-        return text + f"bayespbrl.resume({str(evidence.path)!r}) goes on in Python, given what was the user's own."
-    return text + f"bayespbrl resume {evidence.path} goes on."
+    question = "" if contents.open_question is None else f" Question {contents.open_question} waits for an answer."
+    text = f"In progress: {done} of {wanted} iterations.{question} "
+    if contents.settings.own_parts:
+        return text + f"Continue it in Python with bayespbrl.resume({str(contents.path)!r}) and your own objects."
+    return text + f"Continue it with: bayespbrl resume {contents.path}"
 
 
-def _facts(evidence: Evidence) -> list[tuple[str, str]]:
-    settings = evidence.settings
+def _facts(contents: RunContents) -> list[tuple[str, str]]:
+    settings, model = contents.settings, contents.model
     expert = settings.expert + (f", {settings.wrong_answers:.0%} wrong" if settings.wrong_answers else "")
     return [
-        ("likelihood", settings.likelihood),
-        ("prior scale σ", f"{evidence.fitted_with('prior_scale'):g}"),
-        ("steepness m", f"{evidence.fitted_with('steepness'):g}"),
-        ("lapse rate λ", f"{evidence.fitted_with('lapse_rate'):g}"),
-        ("KL bound ε", f"{settings.kl_bound:g}"),
-        ("updates an iteration, at most", str(settings.updates_per_iteration)),
-        ("iterations in a row without a question, at most", str(settings.unasked_iterations)),
-        ("discount γ of Q", f"{settings.discount:g}"),
-        ("discount γ of ψ", f"{settings.psi_discount:g}"),
-        ("policy", settings.policy),
+        ("likelihood", settings.model.likelihood),
+        ("prior scale σ", f"{model.prior_scale:g}"),
+        ("steepness m", f"{model.steepness:g}"),
+        ("lapse rate λ", f"{model.lapse_rate:g}"),
+        ("KL bound ε", f"{settings.update.kl_bound:g}"),
+        ("most updates per iteration", str(settings.update.updates_per_iteration)),
+        ("most iterations in a row without a question", str(settings.questions.unasked_iterations)),
+        ("discount γ of Q", f"{settings.critic.discount:g}"),
+        ("discount γ of ψ", f"{settings.trajectory_discount:g}"),
+        ("policy", settings.rollouts.policy),
         ("expert", expert),
-        ("schedule", settings.schedule),
-        ("query", settings.query),
-        ("hyperparameters", settings.hyperparameters),
+        ("schedule", settings.update.schedule),
+        ("query", settings.questions.query),
+        ("hyperparameters", settings.estimation.hyperparameters),
     ]
-
-
-def _write_pictures(folder: Path, sections: list[Section]) -> None:
-    folder.mkdir(exist_ok=True)
-    for section in sections:
-        for block in section.blocks:
-            pictures = (
-                block.pictures if isinstance(block, Comparison) else (block,) if isinstance(block, Picture) else ()
-            )
-            for picture in pictures:
-                (folder / f"{picture.name}.png").write_bytes(picture.png)
