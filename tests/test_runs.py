@@ -139,7 +139,7 @@ def test_what_is_loaded_is_what_was_learned(finished, straight):
 def test_loading_changes_nothing(finished):
     before = contents(finished)
     run = bayespbrl.load(finished)
-    run.evaluate(2)
+    run.evaluate(3)
     assert contents(finished) == before
 
 
@@ -171,7 +171,7 @@ class Odd(gymnasium.Env):
 @pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(2, start=1), gymnasium.spaces.Box(-1, 1, (1, 2))])
 def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):
     environment = Odd(space)
-    bayespbrl.start(environment, tmp_path / "run", **(QUICK | {"iterations": 1, "centres": 5})).run(ReturnExpert())
+    bayespbrl.start(environment, tmp_path / "run", **(QUICK | {"centres": 5})).ask()
     policy = bayespbrl.load(tmp_path / "run", env=environment).policy
     observation, _ = environment.reset(seed=0)
     for _ in range(8):
@@ -187,7 +187,7 @@ def test_settings_come_back_as_they_were_kept_whatever_the_preset_says_today(tmp
 
 def test_an_environment_that_was_open_already_is_acted_in_as_it_is(tmp_path):
     environment = open_environment(Odd(gymnasium.spaces.Discrete(2, start=1)))
-    bayespbrl.start(environment, tmp_path / "run", **(QUICK | {"iterations": 1, "centres": 5})).run(ReturnExpert())
+    bayespbrl.start(environment, tmp_path / "run", **(QUICK | {"centres": 5})).ask()
     policy = bayespbrl.load(tmp_path / "run", env=environment).policy
     observation, _ = environment.reset(seed=0)
     assert all(environment.action_space.contains(policy.act(observation)) for _ in range(8))
@@ -195,8 +195,8 @@ def test_an_environment_that_was_open_already_is_acted_in_as_it_is(tmp_path):
 
 def test_evaluation_is_a_function_of_the_seed(finished):
     run = bayespbrl.load(finished)
-    assert run.evaluate(5, seed=1) == run.evaluate(5, seed=1) == bayespbrl.load(finished).evaluate(5, seed=1)
-    assert run.evaluate(5, seed=1) != run.evaluate(5, seed=2)
+    assert run.evaluate(3, seed=1) == run.evaluate(3, seed=1) == bayespbrl.load(finished).evaluate(3, seed=1)
+    assert run.evaluate(3, seed=1) != run.evaluate(3, seed=2)
 
 
 def test_a_directory_appears_with_its_settings_in_it_or_not_at_all(tmp_path, monkeypatch):
@@ -645,8 +645,7 @@ def test_an_environment_that_its_name_would_not_give_again_has_to_be_passed(tmp_
         )
         return gymnasium.wrappers.ClipReward(environment, -1.0, 0.0) if how == "wrapper" else environment
 
-    options = {"utility": "linear-program", "iterations": 1, "max_steps": 5, "evaluation_episodes": 1, "centres": 5}
-    bayespbrl.start(made(), tmp_path / "run", **options).run(ReturnExpert())
+    bayespbrl.start(made(), tmp_path / "run", utility="linear-program", max_steps=5).ask()
     for read in (bayespbrl.load, runs.resume):
         with pytest.raises(ValueError, match="environment of the user's own: expected it again as env="):
             read(tmp_path / "run")
