@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -16,7 +16,7 @@ from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import AveragedUtility, FitQuality, LinearProgramUtility, PosteriorUtility, UtilityEstimate
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
-ENGINE: Any = "h5netcdf"
+ENGINE: Final = "h5netcdf"
 PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "policy", "estimate")}
 
 
