@@ -33,10 +33,13 @@ def check_shapes(function):
 
 jaxtyping.install_import_hook(CHECKED, "conftest.check_shapes")
 
-# Test processes run side by side. With one thread each, the linear algebra of one does not wait for that of another:
-# here, where NumPy has its threads already, and in the processes that tests start.
-threadpool_limits(1)
-os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+# Test processes run side by side. With one thread each, the linear algebra of one does not wait for that of another.
+threadpool_limits(1)  # here, where NumPy has its threads already
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # in what tests start
+# All of them, and the next session, share what JAX has compiled. A file that was cut short is compiled again.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
+os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
+os.environ["PYTHONWARNINGS"] = "ignore:Error reading persistent compilation cache entry"
 
 import bayespbrl
 
