@@ -273,7 +273,7 @@ def test_the_summary_counts_the_comparisons_since_the_undominated_trajectory(tmp
         better = asked.index(newcomer) < 3
         return "first" if (first is learner.trajectories[newcomer]) == better else "second"
 
-    learner = start(tmp_path / "run", iterations=5)
+    learner = start(tmp_path / "run", utility="linear-program", iterations=5)
     learner.run(expert)
     best = asked[2]
     text = read(write_report(tmp_path / "run")).text
@@ -356,7 +356,7 @@ def test_a_schedule_may_report_any_statistics(tmp_path):
     def clock(situation):
         return Bound(0.3, "by the clock", statistics={"iteration": float(situation.iteration), "kl": 0.5})
 
-    start(tmp_path / "run", schedule=clock, iterations=2).run(ReturnExpert())
+    start(tmp_path / "run", utility="linear-program", schedule=clock, iterations=2).run(ReturnExpert())
     page = write_report(tmp_path / "run").read_text(encoding="utf-8")
     assert "could not be made" not in page
     assert "by the clock" in page
@@ -491,7 +491,7 @@ def test_features_of_the_users_are_asked_for_and_used_when_passed(tmp_path):
         return np.stack([states % 5, states // 5], axis=1).astype(float)
 
     directory = tmp_path / "run"
-    bayespbrl.start("gridworld", directory, features=own, **QUICK).run(ReturnExpert())
+    start(directory, features=own, iterations=2).run(ReturnExpert())
     without = read(write_report(directory)).text
     assert "features are a function of your own, and it was not passed again" in without
     assert "could not be made" not in without

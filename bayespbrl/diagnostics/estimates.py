@@ -7,6 +7,8 @@ from bayespbrl.models.likelihoods import prob
 from bayespbrl.trajectories import Trajectory, trajectory_features
 from bayespbrl.utility import AveragedUtility, LinearProgramUtility, PosteriorUtility, UtilityEstimate
 
+StateUtility = PosteriorUtility | LinearProgramUtility | AveragedUtility
+
 
 def sampled(estimate: UtilityEstimate | None) -> PosteriorUtility | None:
     """The setting whose posterior was sampled; None where there is no estimate or no posterior."""
@@ -32,16 +34,12 @@ def is_average(estimate: UtilityEstimate | None) -> TypeGuard[AveragedUtility]:
     return isinstance(estimate, AveragedUtility)
 
 
-def of_states(
-    estimate: UtilityEstimate | None,
-) -> TypeGuard[PosteriorUtility | LinearProgramUtility | AveragedUtility]:
+def of_states(estimate: UtilityEstimate | None) -> TypeGuard[StateUtility]:
     """Whether it is a utility of states, as every estimate is but the known reward."""
-    return isinstance(estimate, PosteriorUtility | LinearProgramUtility | AveragedUtility)
+    return isinstance(estimate, StateUtility)
 
 
-def one_setting(
-    estimate: PosteriorUtility | LinearProgramUtility | AveragedUtility,
-) -> PosteriorUtility | LinearProgramUtility:
+def one_setting(estimate: StateUtility) -> PosteriorUtility | LinearProgramUtility:
     """The estimate itself, linear in features of the state, or the sampled setting of an average."""
     return estimate if isinstance(estimate, LinearProgramUtility) else estimate.sampled
 

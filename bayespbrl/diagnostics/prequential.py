@@ -130,7 +130,10 @@ def score_predictions(
       isotonic regression of the outcomes (pool-adjacent-violators), `band_lower`, `band_upper`; and the numbers
       `log_score` (summed log probability of the outcomes, nats, 0 is best) and `brier_score` (mean squared error, 0 is
       best), each with its expectation `…_expected` and standard deviation `…_sd` under the predictions themselves;
-      `miscalibration`, `discrimination`, `uncertainty`: brier_score = miscalibration − discrimination + uncertainty.
+      `log_score_z`, the log score less its expectation in standard deviations: below −2 the predictions are
+      overconfident; `miscalibration`, `discrimination`, `uncertainty`: brier_score = miscalibration − discrimination +
+      uncertainty; `expected_calibration_error`: mean distance between confidence max(p, 1 − p) and the share of right
+      predictions, over bins of width 0.1.
       Means over no predictions are NaN.
 
     Source: Dimitriadis, Gneiting & Jordan (2021), the curve of `arviz_plots.plot_ppc_pava`.
@@ -197,6 +200,7 @@ def _scores(predicted: np.ndarray, observed: np.ndarray, recalibrated: np.ndarra
     if number == 0:
         sums, brier = ("log_score", "log_score_expected", "log_score_sd"), ("", "_expected", "_sd")
         means = (*(f"brier_score{end}" for end in brier), "miscalibration", "discrimination", "uncertainty")
+        means += ("log_score_z", "expected_calibration_error")
         return dict.fromkeys(sums, 0.0) | dict.fromkeys(means, np.nan)
     variance = predicted * (1 - predicted)
     # a prediction of 0 or 1 has infinite log odds and adds no variance
@@ -205,10 +209,17 @@ def _scores(predicted: np.ndarray, observed: np.ndarray, recalibrated: np.ndarra
     brier = np.mean((predicted - observed) ** 2)
     uncertainty = np.mean(observed) * (1 - np.mean(observed))
     after = np.mean((recalibrated - observed) ** 2)
+    score = np.sum(xlogy(observed, predicted) + xlog1py(~observed, -predicted))
+    expected = np.sum(xlogy(predicted, predicted) + xlog1py(1 - predicted, -predicted))
+    deviation = np.sqrt(np.sum(variance * log_odds**2))
+    confidence, right = np.maximum(predicted, 1 - predicted), np.where(predicted >= 0.5, observed, ~observed)
+    bins = np.minimum((confidence * 10).astype(int), 9)
     return {
-        "log_score": np.sum(xlogy(observed, predicted) + xlog1py(~observed, -predicted)),
-        "log_score_expected": np.sum(xlogy(predicted, predicted) + xlog1py(1 - predicted, -predicted)),
-        "log_score_sd": np.sqrt(np.sum(variance * log_odds**2)),
+        "log_score": score,
+        "log_score_expected": expected,
+        "log_score_sd": deviation,
+        "log_score_z": (score - expected) / deviation if deviation > 0 else np.nan,
+        "expected_calibration_error": np.sum(np.abs(np.bincount(bins, right - confidence))) / number,
         "brier_score": brier,
         "brier_score_expected": np.mean(variance),
         "brier_score_sd": np.sqrt(np.sum(variance * (1 - 2 * predicted) ** 2)) / number,

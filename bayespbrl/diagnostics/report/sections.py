@@ -1,5 +1,6 @@
 """The other sections of a report: learning curve, convergence, calibration, policy updates, sensitivity, iterations."""
 
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -161,12 +162,17 @@ def _reported(iterations: xr.Dataset, group: str, label: str) -> list[Block]:
     short = {name: name.removeprefix(group + " ") for name in names}
     numeric = [name for name in names if iterations[name].dtype.kind == "f" and iterations[name].notnull().any()]
     panels = [("", partial(figures.plot_column, iterations, name, label=short[name])) for name in numeric[:4]]
-    rows = [
-        [str(int(iterations["iteration"][i])), *(cell(iterations[name].values[i]) for name in names)]
-        for i in range(iterations.sizes["iteration"])
-    ]
-    table = Table(f"{label}, by iteration.", ["iteration", *short.values()], rows)
-    return [*([drawn(group, panels, f"{label}, by iteration.", f"{label} by iteration.")] if panels else []), table]
+    caption = f"{label}, by iteration."
+    figure = [drawn(group, panels, caption, caption)] if panels else []
+    return [*figure, _by_iteration(iterations, short, caption)]
+
+
+def _by_iteration(iterations: xr.Dataset, columns: Mapping[str, str], caption: str) -> Table:
+    """Variables of the iterations, `columns` by their heads, as a table of one row per iteration."""
+    values = [iterations[name].values for name in ("iteration", *columns)]
+    return Table(
+        caption, ["iteration", *columns.values()], [[cell(v) for v in row] for row in zip(*values, strict=True)]
+    )
 
 
 def sensitivity_to_model(contents: RunContents) -> Body:
@@ -200,8 +206,4 @@ def all_iterations(iterations: xr.Dataset) -> Body:
     """All iterations as one table."""
     if not iterations.sizes["iteration"]:
         return ["No iteration is completed yet."], []
-    rows = [
-        [str(int(iterations["iteration"][i])), *(cell(float(iterations[name][i])) for name in COLUMNS)]
-        for i in range(iterations.sizes["iteration"])
-    ]
-    return [], [Table("One row per iteration.", ["iteration", *COLUMNS.values()], rows)]
+    return [], [_by_iteration(iterations, COLUMNS, "One row per iteration.")]
