@@ -71,7 +71,7 @@ def resume(
       ValueError: a directory that is no run, or a file in it that is truncated or foreign.
     """
     log = RunDirectory.open(directory)
-    learner = _restored(log, env, features, policy, schedule, query)
+    learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
     log.drop_partial_line()
     log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
     return learner.logged(log)
@@ -95,40 +95,22 @@ def load(
         schedule = ConstantBound()
     if log.settings.questions.query == "other" and query is None:
         query = highest_utility
-    return Run(log.path, _restored(log, env, features, policy, schedule, query))
+    return Run(log.path, _restored(log, env, features=features, policy=policy, schedule=schedule, query=query))
 
 
-def _restored(
-    log: RunDirectory,
-    env: AnyEnvironment | None,
-    features: StateFeatures | None,
-    policy: Policy | None,
-    schedule: Schedule | None,
-    query: QueryRule | None,
-) -> Learner:
+def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Learner:
+    """The learner by the log of a run; `own` are the user's objects by the names of their options."""
     settings = log.settings
-    for part, own, given in (
-        ("features", settings.features.features, features),
-        ("policy", settings.rollouts.policy, policy),
-        ("schedule", settings.update.schedule, schedule),
-        ("query", settings.questions.query, query),
-    ):
-        if (own == "other") != (given is not None):
-            had, expected = ("with", "it again as") if own == "other" else ("without", "no")
-            raise ValueError(f"{log.path}: a run {had} {part} of the user's own: expected {expected} {part}=")
+    for name, given in own.items():
+        if (settings.options()[name] == "other") != (given is not None):
+            had, expected = ("without", "no") if given is not None else ("with", "it again as")
+            raise ValueError(f"{log.path}: a run {had} {name} of the user's own: expected {expected} {name}=")
     if settings.environment == "other" and env is None:
         raise ValueError(f"{log.path}: a run with an environment of the user's own: expected it again as env=")
-    summarised = log.summarised()
+    summarised, policy = log.summarised(), own["policy"]
+    entries = log.entries(features=own["features"], known=() if policy is None else (type(policy),))
     try:
-        learner = Learner(
-            settings.env if env is None else env,
-            features=features,
-            policy=policy,
-            schedule=schedule,
-            query=query,
-            entries=log.entries(features=features, known=() if policy is None else (type(policy),)),
-            kept=settings,
-        )
+        learner = Learner(settings.env if env is None else env, **own, entries=entries, kept=settings)
         log.check_complete(learner.state, summarised)
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
