@@ -366,3 +366,41 @@ def test_single_precision_programs_keep_their_precision():
     with jax.enable_x64(False):
         mcmc = run(EllipticalSlice(regression), X.astype(np.float32), Y.astype(np.float32), num_samples=10)
         assert mcmc.get_samples()["slope"].dtype == jnp.float32
+
+
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [
+        ((np.zeros(3), np.diag([1.0, 1.0, -1e-3])), "a symmetric positive definite covariance, got .* is -0.001"),
+        ((np.zeros(3), np.zeros((3, 3))), "a symmetric positive definite covariance"),
+        ((np.zeros(3), np.triu(np.ones((3, 3)))), "a symmetric positive definite covariance"),
+        ((np.zeros(3), np.eye(2)), r"shapes \(n,\) and \(n, n\), got \(3,\) and \(2, 2\)"),
+        ((np.zeros(3), np.full((3, 3), np.nan)), "finite entries"),
+        ((np.full(3, np.inf), np.eye(3)), "finite entries"),
+    ],
+)
+def test_a_reference_that_is_no_gaussian_is_refused(reference, message):
+    with pytest.raises(ValueError, match=f"^reference: expected {message}"):
+        EllipticalSlice(regression, reference=reference)
+
+
+@pytest.mark.parametrize("value", [jnp.nan, -jnp.inf])
+def test_a_likelihood_that_is_impossible_everywhere_is_flagged_where_arviz_looks(value):
+    def impossible():
+        numpyro.sample("x", dist.Normal(0.0, 1.0))
+        numpyro.factor("never", value)
+
+    stats_group = from_numpyro(run(EllipticalSlice(impossible), num_warmup=0, num_samples=5))["sample_stats"]
+    assert stats_group["diverging"].values.all()
+    regular = from_numpyro(run(EllipticalSlice(regression), X, Y, num_warmup=0, num_samples=5))["sample_stats"]
+    assert not regular["diverging"].values.any()
+
+
+def test_a_subsampled_plate_is_refused():
+    def subsampled(y):
+        x = numpyro.sample("x", dist.Normal(0.0, 1.0))
+        with numpyro.plate("rows", 6, subsample_size=2) as rows:
+            numpyro.sample("y", dist.Normal(x, 1.0), obs=y[rows])
+
+    with pytest.raises(ValueError, match="model: expected whole plates, got 2 of 6 rows in plate 'rows'"):
+        run(EllipticalSlice(subsampled), jnp.arange(6.0), num_samples=5)

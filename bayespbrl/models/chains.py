@@ -69,7 +69,8 @@ class Chains:
         start = np.asarray(problem.centre) + noise @ np.asarray(problem.root).T
         zeros = jnp.zeros(num_chains)
         keys = jax.random.split(jax.random.key(seed), num_chains)
-        state = EllipticalSliceState({"utility_weights": jnp.asarray(start)}, zeros, zeros, zeros.astype(bool), keys)
+        no = zeros.astype(bool)
+        state = EllipticalSliceState({"utility_weights": jnp.asarray(start)}, zeros, zeros, no, no, keys)
         return cls(problem, state, chunk, loadings.shape[1], len(loadings))
 
     @property
@@ -89,6 +90,7 @@ class Chains:
                     "lp": np.asarray(states.log_likelihood),
                     "candidates": np.asarray(states.candidates),
                     "stuck": np.asarray(states.stuck),
+                    "diverging": np.asarray(states.diverging),
                 }
             )
         return replace(self, state=state, draws=tuple(draws))

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro.distributions as dist
 from jax import Array, random
 from jax.flatten_util import ravel_pytree
@@ -36,6 +37,8 @@ class EllipticalSliceState(NamedTuple):
       log_likelihood: log p(observed | z).
       candidates: angles tried per move, in the mean over the draw's moves.
       stuck: whether a move of this draw found no acceptable angle before its cap, and stayed where it was.
+      diverging: whether the likelihood is zero or not a number at z. Collected like that of NUTS, so that ArviZ shows a
+        model whose likelihood is so everywhere.
       rng_key: key of the next draw.
     """
 
@@ -43,6 +46,7 @@ class EllipticalSliceState(NamedTuple):
     log_likelihood: Float[Array, "*chains"]
     candidates: Float[Array, "*chains"]
     stuck: Bool[Array, "*chains"]
+    diverging: Bool[Array, "*chains"]
     rng_key: Shaped[Array, "*chains_and_words"]
 
 
@@ -66,7 +70,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         state says `stuck`.
       reference: (mean (n,), covariance (n, n)) of a Gaussian over the latent sites, flattened in the order of their
         sorted names. Half of the moves, at least one, then go round its ellipses and the rest, at least one, round the
-        prior's, whose tails no narrower reference can be trusted with.
+        prior's, whose tails no narrower reference can be trusted with. The covariance must be positive definite.
       ellipses: (model_args, model_kwargs) ↦ [(Ellipse, moves), ...], instead of those made from the model. For models
         that know a cheaper residual; it is on the caller that it is the model's density.
       log_likelihood: (z, model_args, model_kwargs) ↦ the state's log likelihood, where that is cheaper than the model.
@@ -88,7 +92,8 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         self._model = model
         self._moves, self._batch = checks.whole("moves", moves), checks.whole("batch", batch)
         self._max_candidates = checks.whole("max_candidates", max_candidates)
-        self._reference, self._ellipses = reference, ellipses
+        self._reference = None if reference is None else _checked_reference(*reference)
+        self._ellipses = ellipses
         self._log_likelihood = log_likelihood or self._model_log_likelihood
         # numpyro.infer.MCMC initialises a kernel again on every run where this is missing
         self._sample_fn = self._one_draw
@@ -101,7 +106,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
     @property
     def default_fields(self) -> tuple[str, ...]:
         """Fields collected without asking."""
-        return ("z",)
+        return ("z", "diverging")
 
     def get_diagnostics_str(self, state: EllipticalSliceState) -> str:
         """For the progress bar."""
@@ -136,7 +141,9 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
             z[name] = jnp.asarray(value, dtype=z[name].dtype)
         log_likelihood = self._log_likelihood(z, model_args, model_kwargs)
         one = jnp.ones_like(log_likelihood)
-        return EllipticalSliceState(z, log_likelihood, one, jnp.zeros((), bool), key_state)
+        return EllipticalSliceState(
+            z, log_likelihood, one, jnp.zeros((), bool), ~jnp.isfinite(log_likelihood), key_state
+        )
 
     def sample(
         self, state: EllipticalSliceState, model_args: Args = (), model_kwargs: Keywords | None = None
@@ -162,13 +169,9 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
             )
             tried, stuck = tried + more, stuck | failed
         z = unravel(x)
-        return EllipticalSliceState(
-            z,
-            self._log_likelihood(z, model_args, model_kwargs).astype(state.log_likelihood.dtype),
-            (tried / total).astype(state.candidates.dtype),
-            stuck,
-            key,
-        )
+        log_likelihood = self._log_likelihood(z, model_args, model_kwargs).astype(state.log_likelihood.dtype)
+        candidates = (tried / total).astype(state.candidates.dtype)
+        return EllipticalSliceState(z, log_likelihood, candidates, stuck, ~jnp.isfinite(log_likelihood), key)
 
     def _model_ellipses(
         self,
@@ -233,10 +236,15 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         return self._log_probs(z, model_args, model_kwargs)[1]
 
     def _check(self, sites: Sites, model_args: Args, model_kwargs: Keywords) -> None:
-        """Every latent site is Gaussian, unscaled, unmasked and independent of the others, or there is an error."""
+        """Every latent site is Gaussian, unscaled, unmasked and independent of the others; no plate is subsampled."""
         latent = [name for name, site in sites.items() if _is_latent(site)]
         if not latent:
             raise ValueError("model: expected at least one latent sample site, got none")
+        for name, site in sites.items():
+            if site["type"] == "plate" and (used := len(site["value"])) != site["args"][0]:
+                raise ValueError(
+                    f"model: expected whole plates, got {used} of {site['args'][0]} rows in plate {name!r}"
+                )
         for name in latent:
             fn = sites[name]["fn"]
             while isinstance(fn, dist.ExpandedDistribution | dist.Independent):
@@ -277,7 +285,8 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         self, state: EllipticalSliceState, model_args: Args, model_kwargs: Keywords | None
     ) -> EllipticalSliceState:
         """The log likelihood at z under new model arguments or conditioning values."""
-        return state._replace(log_likelihood=self._log_likelihood(state.z, model_args, model_kwargs or {}))
+        log_likelihood = self._log_likelihood(state.z, model_args, model_kwargs or {})
+        return state._replace(log_likelihood=log_likelihood, diverging=~jnp.isfinite(log_likelihood))
 
     def wrap_model(self, wrapper: Callable[[Callable[..., Any]], Callable[..., Any]]) -> "EllipticalSlice":
         """A copy of this kernel with another model; ellipses made by hand for the old one do not survive."""
@@ -287,6 +296,27 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         kernel._model = wrapper(self._model)
         kernel._sample_fn, kernel._log_likelihood = kernel._one_draw, kernel._model_log_likelihood
         return kernel
+
+
+def _checked_reference(mean: ArrayLike, covariance: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+    """The reference's mean and covariance; `ValueError` unless the covariance fits and is positive definite."""
+    if any(isinstance(part, jax.core.Tracer) for part in (mean, covariance)):
+        return mean, covariance  # within a compiled function there are no values to look at
+    mean, covariance = np.asarray(mean, dtype=np.float64), checks.matrix("reference", covariance)
+    checks.finite("reference", mean)
+    if mean.ndim != 1 or covariance.shape != (len(mean), len(mean)):
+        raise ValueError(f"reference: expected shapes (n,) and (n, n), got {mean.shape} and {covariance.shape}")
+    try:
+        if not np.allclose(covariance, covariance.T):
+            raise np.linalg.LinAlgError
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        smallest = np.linalg.eigvalsh((covariance + covariance.T) / 2)[0]
+        raise ValueError(
+            f"reference: expected a symmetric positive definite covariance, got one whose smallest eigenvalue is "
+            f"{smallest:.3g}"
+        ) from None
+    return mean, covariance
 
 
 def _is_latent(site: dict[str, Any], z: Values | None = None) -> bool:

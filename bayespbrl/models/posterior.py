@@ -72,7 +72,7 @@ def sample_posterior(
       A tree with the groups
       `posterior`: margins (chain, draw, preference), coordinates z (chain, draw, coordinate), and utility_weights
         (chain, draw, feature), which is computed where it is indexed and held nowhere;
-      `sample_stats`: lp (log likelihood), candidates (per move), stuck;
+      `sample_stats`: lp (log likelihood), candidates (per move), stuck, diverging (a likelihood of zero or NaN);
       `log_likelihood`: answers (chain, draw, preference); `observed_data`: answers, 1 as given and 0 for a tie;
       `constant_data`: differences;
       at the root: utility_weights_mean (feature), whose part outside the differences' row space is exactly zero;

@@ -24,9 +24,8 @@ def posterior_tree(
     `fit` is where the chains began, `report` of the margins' draws, and `attributes` are kept with the tree.
     """
     sample, answer = ("chain", "draw"), ("chain", "draw", "preference")
-    z, answers, stuck, candidates = (
-        chains.collected(name, length) for name in ("coordinates", "answers", "stuck", "candidates")
-    )
+    z, answers = chains.collected("coordinates", length), chains.collected("answers", length)
+    flags = {name: (sample, chains.collected(name, length)) for name in ("candidates", "stuck", "diverging")}
     lp = np.sum(answers, axis=2)
     labels = {"chain": np.arange(z.shape[0]), "draw": np.arange(length)}
     likelihood, basis = fit.likelihood, fit.factors.basis
@@ -44,11 +43,11 @@ def posterior_tree(
         "log_evidence_converged": int(fit.approximation.converged),
         "rhat_max": report.rhat_max,
         "effective_sample_size_min": min(report.effective_sample_size_min, float(lp.size)),
-        "converged": int(report.converged()),
-        "stuck": int(np.sum(stuck)),
+        "converged": int(report.converged() and not np.any(flags["diverging"][1])),
+        "stuck": int(np.sum(flags["stuck"][1])),
     }
     draws = {"margins": (answer, z @ fit.factors.loadings.T), "coordinates": ((*sample, "coordinate"), z)}
-    statistics = {"lp": (sample, lp), "candidates": (sample, candidates), "stuck": (sample, stuck)}
+    statistics = {"lp": (sample, lp), **flags}
     root = xr.Dataset({f"utility_weights_{name}": ("feature", w) for name, w in points.items()}, attrs=root_attributes)
     return xr.DataTree.from_dict(
         {
