@@ -1,0 +1,62 @@
+"""Calibration of the predicted answers of many runs: was each answer as probable as the learner said beforehand?
+
+    bayespbrl trials swing-up --trials 10 --seed 3000 --out runs/swing-up
+    python benchmarks/calibration.py runs/swing-up runs/gridworld …
+
+Each argument is a run directory or a folder of them, and becomes one row. An answer is predicted by the posterior that
+the learner had when it asked; the first iteration, in which it had none, is left out. `z` is the log score less its
+expectation under the predictions themselves, in standard deviations: below −2 the predictions are overconfident. `ECE`
+is the expected calibration error over bins of width 0.1 of the confidence. The last column is the share of right
+predictions among those stated with at least 0.95.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from bayespbrl.diagnostics import score_predictions
+from bayespbrl.diagnostics.report.contents import read_contents
+from bayespbrl.preferences import Answer
+
+SURE = 0.95
+
+
+def predictions(study: Path) -> tuple[np.ndarray, np.ndarray, int]:
+    """Probability that the first shown is preferred, whether it was, for all answers of a study; number of runs."""
+    runs = (
+        [study] if (study / "settings.json").exists() else sorted(path.parent for path in study.glob("*/settings.json"))
+    )
+    if not runs:
+        raise ValueError(f"{study}: expected a run directory or a folder of them, got none")
+    asked = [answer for run in runs for answer in read_contents(run).answers]
+    decided = [a for a in asked if a.iteration > 1 and a.row is not None and np.isfinite(a.predicted)]
+    predicted = np.array([answer.predicted for answer in decided])
+    return predicted, np.array([answer.answer is Answer.FIRST for answer in decided], dtype=bool), len(runs)
+
+
+def row(study: Path) -> list[str]:
+    """One line of the table."""
+    predicted, observed, runs = predictions(study)
+    scores = score_predictions(np.clip(predicted, 0, 1), observed)
+    confidence = np.maximum(predicted, 1 - predicted)
+    right = np.where(predicted >= 0.5, observed, ~observed)[confidence >= SURE]
+    score, expected, deviation, z, error = (
+        float(scores[name])
+        for name in ("log_score", "log_score_expected", "log_score_sd", "log_score_z", "expected_calibration_error")
+    )
+    sure = f"{right.mean():.2f} (n = {len(right)})" if len(right) else "–"
+    of_scores = [f"{score:.1f}", f"{expected:.1f} ± {deviation:.1f}", f"{z:.1f}", f"{error:.3f}"]
+    return [study.name, str(runs), str(len(predicted)), *of_scores, sure]
+
+
+def main(studies: list[str]) -> None:
+    """Print the table as markdown."""
+    columns = ["study", "runs", "answers", "log score", "expected ± sd", "z", "ECE", f"right of those ≥ {SURE}"]
+    print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
+    for study in studies:
+        print(f"| {' | '.join(row(Path(study)))} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
