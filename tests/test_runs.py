@@ -23,7 +23,7 @@ from bayespbrl.envs.opening import given_by_name, open_environment
 from bayespbrl.policies import TabularPolicy
 from bayespbrl.runs import directory as run_directory
 from bayespbrl.runs import run as runs
-from bayespbrl.runs.directory import RunDirectory
+from bayespbrl.runs.directory import PartialLine, RunDirectory, read_log_lines
 from bayespbrl.settings import PRESETS
 
 QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
@@ -561,6 +561,18 @@ def test_a_foreign_line_in_the_log_is_refused(copy, line):
         with pytest.raises(ValueError, match=r"copy: (events\.jsonl, line 3: expected an event|.*expected)"):
             read(copy)
     assert contents(copy) == before
+
+
+def test_each_line_of_a_log_is_an_event_or_says_what_stands_there_instead(tmp_path):
+    log = tmp_path / "events.jsonl"
+    assert read_log_lines(log) == []
+    log.write_bytes(b'{"event": "asked"}\n\xff\xfe\n{"event": "improved"}\n{"event": "undone"}\n{"event": "un')
+    first, undecodable, without_iteration, last, cut_off = read_log_lines(log)
+    assert (first, last) == ({"event": "asked"}, {"event": "undone"})
+    assert "events.jsonl, line 2: expected an event, got" in str(undecodable)
+    assert 'line 3: expected an event, got \'{"event": "improved"}\'' in str(without_iteration)
+    assert isinstance(cut_off, PartialLine)
+    assert not isinstance(undecodable, PartialLine)
 
 
 def rows(states):
