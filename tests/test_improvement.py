@@ -203,7 +203,7 @@ def test_repeated_improvement_with_the_reward_finds_the_policy_of_value_iteratio
     "utilities", [np.zeros(3), np.full(400, np.nan), np.r_[np.zeros(399), np.inf], np.zeros((400, 1))]
 )
 def test_utilities_that_do_not_fit_or_are_not_finite_are_refused(utilities):
-    with pytest.raises(ValueError, match="utilities: expected (shape \\(400,\\)|finite entries)"):
+    with pytest.raises(ValueError, match=r"utilities: expected (shape \(400,\)|finite entries)"):
         improve(random_policy(), random_steps()[0], utilities)
 
 
