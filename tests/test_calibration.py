@@ -51,6 +51,10 @@ def test_scores_of_two_predictions_by_hand():
         0.8 * np.log(0.8) + 0.2 * np.log(0.2) + 0.3 * np.log(0.3) + 0.7 * np.log(0.7)
     )
     assert float(result["brier_score_expected"]) == pytest.approx((0.16 + 0.21) / 2)
+    # said 0.8 and was right, said 0.7 for the other side and was wrong: two bins of one prediction each
+    assert float(result["expected_calibration_error"]) == pytest.approx((0.2 + 0.7) / 2)
+    sd = np.sqrt(0.8 * 0.2 * np.log(4) ** 2 + 0.3 * 0.7 * np.log(7 / 3) ** 2)
+    assert float(result["log_score_z"]) == pytest.approx(float(result["log_score"] - result["log_score_expected"]) / sd)
     np.testing.assert_allclose(result["frequency"], [1, 1])
     assert float(result["uncertainty"]) == 0
     assert float(result["miscalibration"]) == pytest.approx(0.265)
@@ -80,6 +84,8 @@ def test_calibrated_predictions_are_found_calibrated_and_overconfident_ones_are_
     assert abs(float(good["log_score"] - good["log_score_expected"])) < 3 * float(good["log_score_sd"])
     assert float(bold["log_score"]) < float(bold["log_score_expected"]) - 5 * float(bold["log_score_sd"])
     assert float(bold["log_score"]) < float(good["log_score"]) - 10
+    assert float(bold["log_score_z"]) < -5 < -3 < float(good["log_score_z"])
+    assert float(bold["expected_calibration_error"]) > 2 * float(good["expected_calibration_error"])
     assert float(bold["brier_score"]) > float(good["brier_score"])
     assert float(bold["miscalibration"]) > 3 * float(good["miscalibration"])
     # sharpening does not change the order of the forecasts, and so not what they discriminate
