@@ -1,11 +1,11 @@
-"""Where the time of a trial goes: seconds by step of the cycle, and the peak of memory.
+"""Seconds of a trial by step of the cycle, and its peak memory.
 
     python benchmarks/cycle.py [gridworld|bicycle|swing-up|acrobot|<gymnasium id>]
-        [--iterations N] [--seed S] [--utility NAME] [--policy KIND]
+        [--iterations N] [--seed S] [--utility NAME] [--policy KIND] [--centres N]
 
-runs one trial with the simulated expert and the domain's preset, and prints a table and one JSON line. The library is
-timed from outside: its functions are replaced by timed ones wherever they are bound. Each second counts once, for the
-innermost step, and a second in which JAX traces or compiles for `compilation` instead of the step that needed it.
+One trial with the simulated expert and the preset of the domain. Prints a table and one JSON line. The functions of the
+steps are replaced by timed ones wherever they are bound. Each second counts once, for the innermost step. A second in
+which JAX traces or compiles counts for `compilation` instead.
 """
 
 import argparse
@@ -25,7 +25,7 @@ import jax
 from bayespbrl import Learner, ReturnExpert, features, models, policies, rollouts, trajectories
 from bayespbrl.improvement import lstd, reps
 from bayespbrl.policies import batch, hyperparameter_search
-from bayespbrl.utility import hyperparameters as evidence
+from bayespbrl.utility import hyperparameters
 
 FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
     "features": (
@@ -33,8 +33,8 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
         features.draw_state_action_features,
         trajectories.trajectory_features,
     ),
-    "sampler": (models.sample_posterior,),
-    "evidence": (evidence.choose_hyperparameters,),
+    "sampler": (models.posterior_draws,),
+    "hyperparameters": (hyperparameters.choose_hyperparameters,),
     "linear program": (models.linear_program,),
     "LSTD": (lstd.transition_sums, lstd.solve_lstd),
     "dual": (reps.reps_weights, reps.reps_weights_by_state),
@@ -64,11 +64,11 @@ REST = "rest"
 
 
 class Stopwatch:
-    """Seconds by step, each counted once: for the step that was entered last.
+    """Seconds by step; each counts for the step that was entered last.
 
     Attributes:
       seconds: by step.
-      programs: compiled so far.
+      programs: number of programs compiled so far.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class Stopwatch:
         self._compiled: list[tuple[float, float]] = []  # intervals, disjoint and in order
 
     def switch(self) -> None:
-        """Book the time since the last switch on the innermost step."""
+        """Add the time since the last switch to the innermost step."""
         now = time.perf_counter()
         step = self._inside[-1]
         self.seconds[step] = self.seconds.get(step, 0.0) + now - self._since
@@ -101,7 +101,7 @@ class Stopwatch:
         return wrapper
 
     def compiled(self, event: str, duration_secs: float, **details: Any) -> None:
-        """Listen to JAX: what has just been traced or compiled, moved from the step it happened in."""
+        """Listener of JAX: move the time of what was just traced or compiled away from the step that needed it."""
         if not event.startswith("/jax/core/compile/"):
             return
         self.programs += event.endswith("backend_compile_duration")
@@ -117,7 +117,7 @@ class Stopwatch:
 
 
 def install(stopwatch: Stopwatch) -> None:
-    """Replace the functions of the steps by timed ones, in every module that has bound them."""
+    """Replace the functions of the steps by timed ones, in every module that binds them."""
     for step, functions in FUNCTIONS.items():
         for function in functions:
             timed = stopwatch.timed(step, function)
@@ -133,7 +133,7 @@ def install(stopwatch: Stopwatch) -> None:
 
 
 def measure(environment: str, **settings: Any) -> dict[str, Any]:
-    """One trial, measured; as the JSON line has it."""
+    """The figures of one trial, as in the JSON line."""
     stopwatch = Stopwatch()
     install(stopwatch)
     began = [time.perf_counter()]
@@ -150,7 +150,7 @@ def measure(environment: str, **settings: Any) -> dict[str, Any]:
     return {
         "benchmark": "cycle",
         "environment": environment,
-        "utility": learner.settings.utility,
+        "utility": learner.settings.estimation.utility,
         "seed": learner.settings.seed,
         "iterations": learner.settings.iterations,
         "answers": learner.preferences.answers,
@@ -167,7 +167,7 @@ def measure(environment: str, **settings: Any) -> dict[str, Any]:
 
 
 def peak_memory() -> int:
-    """KiB; of this program alone, where the system tells: the resource usage also remembers who started it."""
+    """KiB, of this process alone where the system tells; the resource usage may include its parent's."""
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
     own = [int(line.split()[1]) for line in lines if line.startswith("VmHWM")]
@@ -175,7 +175,7 @@ def peak_memory() -> int:
 
 
 def main() -> None:
-    """Measure, and print a table and one JSON line."""
+    """Measure, then print a table and one JSON line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("environment", nargs="?", default="swing-up")
     parser.add_argument("--iterations", type=int)

@@ -1,16 +1,16 @@
-"""Effective draws per second of our posterior against blackjax's elliptical slice sampler on the same posterior.
+"""Effective draws a second of our posterior and of blackjax's elliptical slice sampler on the same posterior.
 
     python benchmarks/elliptical_slice.py --differences differences.npy [--steepness 5] [--prior-scale 1]
     python benchmarks/elliptical_slice.py --scaling
 
-The differences are divided by their largest absolute entry. Prints one JSON line; `--scaling` prints instead a table of
-seconds to convergence against K and D on differences of random smooth trajectories.
+The differences are divided by their largest absolute entry. Prints one JSON line. `--scaling` prints a table of seconds
+to convergence against K and D instead, on differences of random smooth trajectories.
 """
 
 import argparse
 import json
 import time
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 import blackjax
@@ -22,9 +22,11 @@ from bayespbrl.models import sample_posterior
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.likelihoods import Mixed, total_log_prob
 
+DRAWS = 1000  # of each chain, by one call of blackjax's compiled sampler
 
-def report(margins: np.ndarray, seconds: float, compile_seconds: float) -> dict:
-    """The named figures of one sampler; margins (chain, draw, K)."""
+
+def report(margins: np.ndarray, seconds: float, compile_seconds: float) -> dict[str, Any]:
+    """The figures of one sampler, from margins of shape (chain, draw, K)."""
     diagnosis = chain_convergence(margins)
     return {
         "draws": int(margins.shape[0] * margins.shape[1]),
@@ -36,14 +38,12 @@ def report(margins: np.ndarray, seconds: float, compile_seconds: float) -> dict:
     }
 
 
-def ours(differences: np.ndarray, *, steepness: float, prior_scale: float, num_chains: int, seed: int) -> dict:
-    """`sample_posterior` with its defaults, diagnosis included; of three runs the one of median speed."""
+def ours(differences: np.ndarray, *, seed: int, **settings: Any) -> dict[str, Any]:
+    """The figures of `sample_posterior`, convergence checks included: the run of median speed among three."""
 
     def run(seed: int) -> tuple[np.ndarray, float]:
         begin = time.perf_counter()
-        tree = sample_posterior(
-            differences, steepness=steepness, prior_scale=prior_scale, num_chains=num_chains, seed=seed
-        )
+        tree = sample_posterior(differences, seed=seed, **settings)
         return np.asarray(tree["posterior/margins"]), time.perf_counter() - begin
 
     _, first = run(seed)
@@ -54,8 +54,14 @@ def ours(differences: np.ndarray, *, steepness: float, prior_scale: float, num_c
 
 def theirs(
     differences: np.ndarray, *, steepness: float, prior_scale: float, num_chains: int, seed: int, max_seconds: float
-) -> dict:
-    """blackjax in the space of w, jitted, chains vectorised, until the smallest effective sample size is 100."""
+) -> dict[str, Any]:
+    """The figures of blackjax in the space of w, jitted, chains vectorised, until 100 effective draws.
+
+    Args:
+      differences: shape (K, D).
+      steepness, prior_scale, num_chains, seed: as of `sample_posterior`.
+      max_seconds: give up after so long.
+    """
     number, dimension = differences.shape
     likelihood, used = Mixed(steepness, float(number)), jnp.any(differences != 0, axis=1)
     matrix = jnp.asarray(differences)
@@ -65,45 +71,59 @@ def theirs(
         cov=prior_scale**2 * jnp.ones(dimension),
     )
 
-    @partial(jax.jit, static_argnames="length")
-    def advance(key, states, *, length):
-        def chain(key, state):
-            def step(state, key):
+    @jax.jit
+    def advance(key: jax.Array, states: Any) -> tuple[Any, jax.Array]:
+        """DRAWS draws of each chain: the last states and the margins."""
+
+        def chain(key: jax.Array, state: Any) -> tuple[Any, jax.Array]:
+            def step(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
                 state, _ = kernel.step(key, state)
                 return state, matrix @ state.position
 
-            return jax.lax.scan(step, state, jax.random.split(key, length))
+            return jax.lax.scan(step, state, jax.random.split(key, DRAWS))
 
         return jax.vmap(chain)(jax.random.split(key, num_chains), states)
 
     key_start, key_compile, key_run = jax.random.split(jax.random.key(seed), 3)
     start = prior_scale * jax.random.normal(key_start, (num_chains, dimension))
     states = jax.vmap(kernel.init)(start)
-    length, begin = 1000, time.perf_counter()
-    jax.block_until_ready(advance(key_compile, states, length=length))
+    begin = time.perf_counter()
+    jax.block_until_ready(advance(key_compile, states))
     first = time.perf_counter() - begin
-    margins, seconds, warm_up, chunk = np.zeros((num_chains, 0, number)), 0.0, True, 0
-    check = 1
+    margins, seconds, chunks = until_effective(advance, states, key_run, max_seconds=max_seconds)
+    return report(margins, seconds, max(first - seconds / chunks, 0.0))
+
+
+def until_effective(
+    advance: Callable[[jax.Array, Any], tuple[Any, jax.Array]], states: Any, key: jax.Array, *, max_seconds: float
+) -> tuple[np.ndarray, float, int]:
+    """Call `advance` until the smallest effective sample size is 100; checked after 2, 3, 5, 9, … calls.
+
+    Returns:
+      margins (chain, draw, K) of all calls but the first, which is the burn-in; seconds and number of all calls.
+    """
+    drawn: list[np.ndarray] = []
+    seconds, check = 0.0, 1
     while True:
         begin = time.perf_counter()
-        states, drawn = jax.block_until_ready(advance(jax.random.fold_in(key_run, chunk), states, length=length))
+        states, margins = jax.block_until_ready(advance(jax.random.fold_in(key, len(drawn)), states))
         seconds += time.perf_counter() - begin
-        chunk += 1
-        if warm_up:
-            warm_up = False
-            continue
-        margins = np.concatenate([margins, np.asarray(drawn)], axis=1)
-        if chunk > check:
+        drawn.append(np.asarray(margins))
+        if len(drawn) > check:
             check *= 2
-            if chain_convergence(margins).effective_sample_size_min >= 100 or seconds > max_seconds:
-                break
-    return report(margins, seconds, max(first - seconds / chunk, 0.0))
+            kept = np.concatenate(drawn[1:], axis=1)
+            if chain_convergence(kept).effective_sample_size_min >= 100 or seconds > max_seconds:
+                return kept, seconds, len(drawn)
 
 
 def smooth_differences(number: int, dimension: int, *, seed: int, answers: bool = True) -> np.ndarray:
-    """Differences of discounted radial basis features of random smooth trajectories on a circle × a line.
+    """Differences of discounted radial basis features of random smooth trajectories on a circle × a line, shape (K, D).
 
-    A hidden smooth utility orders each pair, so that the rows are consistent answers.
+    Args:
+      number: K.
+      dimension: D.
+      seed: of everything random.
+      answers: whether a smooth utility orders each pair, so that the rows are consistent answers.
     """
     rng = np.random.default_rng(seed)
     steps = np.arange(61)
@@ -126,40 +146,39 @@ def smooth_differences(number: int, dimension: int, *, seed: int, answers: bool 
 
 
 def timed(differences: np.ndarray, draws: int, **arguments: Any) -> float:
-    """Seconds of `sample_posterior` for so many draws a chain, converged or not."""
+    """Seconds of `sample_posterior` for a fixed number of draws a chain, converged or not."""
     begin = time.perf_counter()
     sample_posterior(differences, num_samples=draws, max_samples=draws, **arguments)
     return time.perf_counter() - begin
 
 
-def scaling(*, steepness: float, prior_scale: float, num_chains: int, seed: int) -> None:
-    """Print seconds to convergence, compiled, against K at D = 700 and against D at K = 41; and the cost of a draw.
+def scaling(*, seed: int, **settings: Any) -> None:
+    """Print seconds to convergence, compilation excluded, against K at D = 700 and D at K = 41, and the cost of a draw.
 
-    The latter is what 3000 draws more of each chain take, over all chains: factorisation and start apart.
+    The cost of a draw is the time of 3000 further draws of each chain, divided by all of them.
     """
     print("|    K |     D | seconds | draws | effective |  R̂ | converged | µs a draw |")
     print("|-----:|------:|--------:|------:|----------:|----:|:----------|----------:|")
     sizes = [(k, 700) for k in (5, 10, 20, 41, 80, 160, 320)] + [(41, d) for d in (100, 2000, 20_000)]
     for number, dimension in sizes:
         differences = smooth_differences(number, dimension, seed=seed)
-        arguments: dict[str, Any] = {"steepness": steepness, "prior_scale": prior_scale, "num_chains": num_chains}
-        sample_posterior(differences, num_samples=1000, num_warmup=0, max_samples=1000, **arguments)
+        sample_posterior(differences, num_samples=1000, num_warmup=0, max_samples=1000, **settings)
         begin = time.perf_counter()
-        tree = sample_posterior(differences, seed=seed, **arguments)
+        tree = sample_posterior(differences, seed=seed, **settings)
         seconds = time.perf_counter() - begin
-        short, long = (timed(differences, draws, seed=seed, **arguments) for draws in (1000, 4000))
+        short, long = (timed(differences, draws, seed=seed, **settings) for draws in (1000, 4000))
         a = tree.attrs
         print(
             f"| {number:4d} | {dimension:5d} | {seconds:7.2f} | {tree['posterior'].sizes['draw']:5d} "
             f"| {a['effective_sample_size_min']:9.0f} | {a['rhat_max']:.3f} | {bool(a['converged'])!s:9} "
-            f"| {(long - short) / 3000 / num_chains * 1e6:9.1f} |",
+            f"| {(long - short) / 3000 / settings['num_chains'] * 1e6:9.1f} |",
             flush=True,
         )
 
 
 def main() -> None:
-    """Read the arguments and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Print one JSON line, or the scaling table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--differences", help="NumPy file, shape (K, D)")
     parser.add_argument("--steepness", type=float, default=5.0)
     parser.add_argument("--prior-scale", type=float, default=1.0)

@@ -1,11 +1,10 @@
-"""Seconds of features and policy fits by number of samples, and how much of the target each fit keeps.
+"""Seconds of features and policy fits by number of samples, and the share of the target that each fit keeps.
 
     python benchmarks/policy_fit.py [--samples 600 2400 12000 24000] [--repeats 5]
 
-One row a policy and N. Weights are those of a relative entropy update with bound 0.35 towards a known target, so that
-"gain" can say which share of the update the fitted policy took over: the rise of the expected objective under the new
-policy over that under the weighted samples. Run on an idle machine, or with OPENBLAS_NUM_THREADS=1: the threads of
-several processes' linear algebra wait for each other, and a fit then takes ten times as long.
+One row for each policy and N. Weights are those of a relative entropy update with bound 0.35 towards a known target.
+"gain" is the rise of the expected objective under the fitted policy over that under the weighted samples. Run it on an
+idle machine, or with OPENBLAS_NUM_THREADS=1: threads of other processes slow a fit down by a factor of ten.
 """
 
 import argparse
@@ -29,17 +28,18 @@ TORQUE = Box(-30.0, 30.0, (1,))
 
 
 def pendulum_states(number: int, rng: np.random.Generator) -> np.ndarray:
+    """Random angles and speeds, shape (number, 2)."""
     return np.column_stack([rng.uniform(-np.pi, np.pi, number), 5 * rng.normal(size=number)])
 
 
 def advantage(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Of a torque near 25 sin θ − 3 θ̇, with the environment's clipping."""
+    """The advantage of each action, best at the torque 25 sin θ − 3 θ̇, with the environment's clipping; shape (N,)."""
     wanted = np.clip(25 * np.sin(states[:, 0]) - 3 * states[:, 1], -30, 30)
     return -np.square((np.clip(actions, -30, 30) - wanted) / 30)
 
 
 def relative_entropy_weights(values: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """p/W ∝ exp(value/η) with KL(p ‖ W) = KL_BOUND and mean one under W."""
+    """p/W ∝ exp(value/η) with KL(p ‖ W) = KL_BOUND, shape (N,); mean one under W."""
 
     def weights(log_temperature: float) -> np.ndarray:
         unscaled = np.exp((values - values.max()) / np.exp(log_temperature))
@@ -63,10 +63,12 @@ def timed(function: Callable[[], Any], repeats: int) -> tuple[float, Any]:
 
 
 def seeded_fit(policy: Any, seed: int, *samples: np.ndarray, **options: Any) -> Any:
+    """The fitted policy, the same at each repetition."""
     return policy.fit(*samples, rng=np.random.default_rng(seed), **options)
 
 
 def features_row(number: int, repeats: int, rng: np.random.Generator) -> None:
+    """Print the seconds of φ(s) and φ(s, a)."""
     states, actions = pendulum_states(number, rng), rng.uniform(-30, 30, (number, 1))
     options = RadialBasisOptions(700, period=PERIOD)
     phi = draw_state_features(STATES, states, options, rng=rng)
@@ -77,7 +79,7 @@ def features_row(number: int, repeats: int, rng: np.random.Generator) -> None:
 
 
 def continuous_rows(name: str, policy: Any, number: int, repeats: int, rng: np.random.Generator, **options) -> None:
-    """Three updates in a row: the first search starts from the median rule, the others from the last result."""
+    """Print three updates in a row; the first search starts from the median rule, the others from the last result."""
     states = pendulum_states(number, rng)
     for update in range(3):
         sampling = partial(sample_actions, policy, jax.random.key(update), states)
@@ -98,7 +100,7 @@ def continuous_rows(name: str, policy: Any, number: int, repeats: int, rng: np.r
 
 
 def softmax_rows(number: int, repeats: int, rng: np.random.Generator) -> None:
-    """Every action of every state, as the learner does it."""
+    """Print three updates in a row with every action of every state, as in the learner."""
     states = pendulum_states(number, rng)
     policy = SoftmaxPolicy.initial(STATES, Discrete(3), period=PERIOD)
     pairs, choices = np.repeat(states, 3, axis=0), np.tile(np.arange(3), number)
@@ -119,6 +121,7 @@ def softmax_rows(number: int, repeats: int, rng: np.random.Generator) -> None:
 
 
 def main() -> None:
+    """Print the rows of each number of samples."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--samples", type=int, nargs="+", default=[600, 2400, 12_000, 24_000])
     parser.add_argument("--repeats", type=int, default=5)

@@ -1,9 +1,9 @@
-"""Steps per second of the compiled rollouts against the same jitted policy stepped through gymnasium, in one run.
+"""Steps per second of the compiled rollouts, and of the same policy stepped through gymnasium.
 
     python benchmarks/rollouts.py [gridworld|bicycle|swing-up|acrobot] [--episodes 100] [--seconds 3]
 
-prints one JSON line. The comparison steps one environment at a time through `gymnasium.make(…).step`, with the policy
-compiled by itself. Both sides are warmed up first; the compiled side returns whole trajectories.
+The comparison steps one environment at a time through `gymnasium.make(…).step`, with the policy compiled by itself.
+Both sides are warmed up first; the compiled side returns whole trajectories. Prints one JSON line.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from bayespbrl.rollouts import open_environment, returns, rollout
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class RadialPolicy:
-    """Mean of 50 radial basis functions plus noise: about what a small Gaussian process costs."""
+    """50 radial basis functions plus noise, about as expensive as a small Gaussian process."""
 
     centres: np.ndarray
     weights: np.ndarray
@@ -49,7 +49,7 @@ class TabularPolicy:
 
 
 def policy_for(env: gymnasium.Env) -> Any:
-    """A fixed policy of the environment's shapes."""
+    """A fixed policy that fits the environment's spaces."""
     rng = np.random.default_rng(0)
     space: Any = env.action_space
     if not isinstance(space, Box):
@@ -72,7 +72,7 @@ def compiled_steps_per_second(name: str, policy: Any, run: Any, episodes: int, s
 
 
 def interface_steps_per_second(name: str, policy: Any, seconds: float) -> float:
-    """The same policy, jitted, and the registered environment, one step at a time."""
+    """Environment steps a second of the jitted policy in the registered environment, one step at a time."""
     env = open_environment(name)
     sample = jax.jit(lambda policy, key, observation: policy.sample(key, observation))
     split = jax.jit(jax.random.split)
@@ -100,7 +100,7 @@ def interface_steps_per_second(name: str, policy: Any, seconds: float) -> float:
 
 
 def main() -> None:
-    """Measure and print one JSON line."""
+    """Measure, then print one JSON line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("environment", nargs="?", default="swing-up")
     parser.add_argument("--episodes", type=int, default=100)

@@ -1,10 +1,10 @@
-"""What the schedule `confidence` costs: each policy update of a run again without it, to the same bound.
+"""Cost of the schedule `confidence`: each policy update of a run again without it, to the same bound.
 
     python benchmarks/schedule.py [gridworld|bicycle|swing-up|…] [--iterations N] [--seed S] [--hyperparameters KIND]
 
-runs a trial that does each update once more with a constant bound, the one that was decided: same utility, same
-transitions, same random choices. It does so twice, and the second time, which compiles nothing, is measured. Prints one
-JSON line: processor seconds of both kinds and the ratio of the difference to all that the trial takes without it.
+Each update is repeated with a constant bound, the one that was decided on, from the same utility, transitions and
+random choices. The trial runs twice; the second run, which compiles nothing, is measured. Prints one JSON line:
+processor seconds with and without the schedule, and the difference as a share of the whole trial without it.
 """
 
 import argparse
@@ -14,21 +14,24 @@ from typing import Any
 
 from bayespbrl import Learner, ReturnExpert
 from bayespbrl.improvement import schedules
+from bayespbrl.improvement.update import Improvement
+from bayespbrl.trajectories import Transitions
+from bayespbrl.utility import UtilityEstimate
 
 
 class Twice(Learner):
-    """A learner that does each update again without looking at draws."""
+    """A learner that repeats each update without looking at posterior draws."""
 
     def __init__(self, *arguments: Any, **settings: Any):
         super().__init__(*arguments, **settings)
         self.seconds = {"with": 0.0, "without": 0.0}
 
-    def _update(self, estimate: Any, steps: Any) -> Any:
+    def _update(self, utility: UtilityEstimate, steps: Transitions) -> tuple[Improvement, schedules.Bound]:
         schedule, began = self.schedule, time.process_time()
-        improved, bound = super()._update(estimate, steps)
+        improved, bound = super()._update(utility, steps)
         between = time.process_time()
         self.schedule = schedules.ConstantBound(bound.kl_bound)
-        super()._update(estimate, steps)
+        super()._update(utility, steps)
         self.schedule = schedule
         self.seconds["with"] += between - began
         self.seconds["without"] += time.process_time() - between
@@ -36,7 +39,7 @@ class Twice(Learner):
 
 
 def measure(environment: str, **settings: Any) -> dict[str, Any]:
-    """Two trials, the second measured; as the JSON line has it."""
+    """The figures of the second of two trials, as in the JSON line."""
     for _ in range(2):
         learner = Twice(environment, schedule="confidence", **settings)
         began = time.process_time()
@@ -47,7 +50,7 @@ def measure(environment: str, **settings: Any) -> dict[str, Any]:
     return {
         "benchmark": "schedule",
         "environment": environment,
-        "hyperparameters": learner.settings.hyperparameters,
+        "hyperparameters": learner.settings.estimation.hyperparameters,
         "iterations": learner.settings.iterations,
         "seconds_without": round(whole, 2),
         "updates_with": round(updates["with"], 2),
@@ -57,7 +60,7 @@ def measure(environment: str, **settings: Any) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, and print one JSON line."""
+    """Measure, then print one JSON line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("environment", nargs="?", default="swing-up")
     parser.add_argument("--iterations", type=int)
