@@ -23,6 +23,18 @@ def benchmark(name):
     return module
 
 
+@pytest.fixture
+def printed(monkeypatch, capsys):
+    """A function of a benchmark's name and arguments that returns the lines it prints, in this process."""
+
+    def run(name, *arguments):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
+        benchmark(name).main()
+        return capsys.readouterr().out.splitlines()
+
+    return run
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("prior_scale", "steepness"), [(1.0, 5.0), (3.0, 0.5)])
 def test_log_evidence_of_41_answers_agrees_with_annealed_particles_within_a_nat(prior_scale, steepness):
@@ -42,7 +54,7 @@ def test_log_evidence_of_41_answers_agrees_with_annealed_particles_within_a_nat(
 
 @pytest.mark.slow
 def test_the_seconds_of_the_steps_of_a_trial_add_up():
-    arguments = ["bicycle", "--iterations", "2", "--centres", "100", "--seed", "4"]
+    arguments = ["bicycle", "--iterations", "2", "--centres", "60", "--seed", "4"]
     run = subprocess.run([sys.executable, str(CYCLE), *arguments], capture_output=True, text=True, check=True)
     *table, line = run.stdout.splitlines()
     result = json.loads(line)
@@ -58,15 +70,14 @@ def test_the_seconds_of_the_steps_of_a_trial_add_up():
     assert all(any(f"  {step} " in row for row in table) for step in steps)
 
 
-def test_a_schedule_costs_what_updates_with_it_take_longer():
-    command = [sys.executable, str(BENCHMARKS / "schedule.py"), "gridworld", "--iterations", "1"]
-    result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+def test_a_schedule_costs_what_updates_with_it_take_longer(printed):
+    result = json.loads(printed("schedule", "gridworld", "--iterations", "1")[0])
     assert 0 < result["updates_without"] < result["seconds_without"]
     longer = result["updates_with"] - result["updates_without"]
     assert result["overhead"] == pytest.approx(longer / result["seconds_without"], abs=0.02 / result["seconds_without"])
 
 
-def test_studies_are_compared_seed_by_seed(tmp_path):
+def test_studies_are_compared_seed_by_seed(tmp_path, printed):
     curves = {"first": {1: [0, 10, 20], 2: [0, 0, 4], 3: [0, 10, 12]}, "second": {3: [0, 20, 22], 1: [10, 20, 25]}}
     curves["longer"] = {seed: [*values, -999] for seed, values in curves["second"].items()}
     curves["asks-less"] = curves["second"]  # after its first two answers it asks nothing more
@@ -82,10 +93,9 @@ def test_studies_are_compared_seed_by_seed(tmp_path):
     uneven = ["1,1,2,5", "1,2,2,30", "2,1,2,5", "2,2,3,40", "3,1,2,5", "3,2,3,50"]
     (tmp_path / "uneven.csv").write_text("\n".join(["seed,iteration,answers,value", *uneven]))
     curves["uneven"] = {}
-    arguments = [str(tmp_path / f"{name}.csv") for name in curves]
-    options = ["--floor", "0", "--ceiling", str(tmp_path / "second.csv"), "--lost", "10"]
-    command = [sys.executable, str(BENCHMARKS / "compare.py"), *arguments, *options]
-    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    studies = [tmp_path / f"{name}.csv" for name in curves]
+    options = ["--floor", "0", "--ceiling", tmp_path / "second.csv", "--lost", "10"]
+    lines = printed("compare", *studies, *options)
     assert lines[0] == "relative value 0.95: 22.32"  # 0.95 of the median of 22 and 25
     first, second, longer, less, uneven = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
     never = "never [never, never]"
@@ -105,7 +115,7 @@ def test_studies_are_compared_seed_by_seed(tmp_path):
     assert uneven[-3:] == ["3", "+5.0 [+5.0, +30.0]", "+36.0 [+10.0, +38.0]"]
 
 
-def test_studies_of_different_seeds_are_joined_and_their_answers_are_shares(tmp_path):
+def test_studies_of_different_seeds_are_joined_and_their_answers_are_shares(tmp_path, printed, capsys):
     header = "seed,iteration,answers,value"
     at = {"soon": [(1, 2), (2, 2)], "later": [(3, 2), (4, 3)], "slow": [(seed, 3) for seed in range(1, 5)]}
     for name, trials in at.items():
@@ -114,22 +124,22 @@ def test_studies_of_different_seeds_are_joined_and_their_answers_are_shares(tmp_
     with (tmp_path / "later.csv").open("a") as longer:
         longer.write("\n3,5,6,-1\n4,5,6,-1")  # an iteration that not all have
     joined = f"{tmp_path / 'soon.csv'}+{tmp_path / 'later.csv'}"
-    command = [sys.executable, str(BENCHMARKS / "compare.py"), "--floor", "0", "--ceiling", "1"]
-    shown = subprocess.run([*command, joined, tmp_path / "slow.csv"], capture_output=True, text=True, check=True).stdout
-    both, slow = ([cell.strip() for cell in line.split("|")[1:-1]] for line in shown.splitlines()[3:])
+    options = ["--floor", "0", "--ceiling", "1"]
+    lines = printed("compare", *options, joined, tmp_path / "slow.csv")
+    both, slow = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
     assert both[:3] == ["soon+later", "4", "1 [1]"]
     # after 3 answers three of the four trials are there: their lower quartile is 0.75, drawn anew often 1
     assert both[-7:-3] == ["3 [3, 4]", "4 [3, 4]", "2; 3", "–"]
     assert slow[-7:-3] == ["4 [4, 4]", "4 [4, 4]", "3; 3", "1.00 [0.75, 1.00]"]
     (tmp_path / "late.csv").write_text("\n".join([header, "1,1,9,1", "2,1,9,1"]))
-    shown = subprocess.run([*command, joined, tmp_path / "late.csv"], capture_output=True, text=True, check=True)
-    assert shown.stderr == ""
-    assert shown.stdout.splitlines()[-1].startswith("| late | 2 | – | – | 1 [1] | – | 9 [9, 9] |")
+    lines = printed("compare", *options, joined, tmp_path / "late.csv")
+    assert lines[-1].startswith("| late | 2 | – | – | 1 [1] | – | 9 [9, 9] |")
     twice = f"{tmp_path / 'soon.csv'}+{tmp_path / 'slow.csv'}"
-    refused = subprocess.run([*command, twice], capture_output=True, text=True, check=False)
-    assert "error: " in refused.stderr
-    assert "expected tables with different seeds, got seed 1 twice" in refused.stderr
-    assert refused.returncode == 2
+    with pytest.raises(SystemExit) as refused:
+        printed("compare", *options, twice)
+    assert refused.value.code == 2
+    assert "error: " in (stderr := capsys.readouterr().err)
+    assert "expected tables with different seeds, got seed 1 twice" in stderr
 
 
 def test_the_index_of_the_results_names_every_file_once_and_nothing_else():
