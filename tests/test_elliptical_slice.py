@@ -14,6 +14,15 @@ from bayespbrl.models.elliptical_slice import BATCHES_AHEAD, Ellipse, elliptical
 from bayespbrl.models.likelihoods import Logistic, Mixed
 
 
+@pytest.fixture(autouse=True, scope="module")
+def quick_compilation():
+    """Without most of the compiler's optimisations: it would take longer than what it compiles, which runs once."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
+
+
 @pytest.fixture(autouse=True)
 def float64():
     with jax.enable_x64(True):
@@ -81,20 +90,30 @@ def exact_draws(key, number, *, steepness, scale, likelihood=None):
     return np.interp(np.asarray(jax.random.uniform(key, (number,))), cdf, w), lambda x: np.interp(x, w, cdf)
 
 
-def p_value_after_moves(kernel, *, steepness=5.0, scale=1.0, number=100_000, moves=1, model_scale=None):
+def mover(*, moves=1, batch=4):
+    """What moves draws of w by the kernel as it is at the first call; to compile once for all laws and references."""
+
+    def move(key, w, steepness, scale, reference):
+        kernel = EllipticalSlice(preference_model, batch=batch, reference=reference)
+        args = jnp.array([[1.0], [0.4], [-0.2]]), Mixed(steepness, 3.0)
+        state = kernel.init(key, 0, {"utility_weights": w[None]}, args, {"prior_scale": scale})
+        state = jax.lax.fori_loop(0, moves, lambda _, s: kernel.sample(s, args, {"prior_scale": scale}), state)
+        return state.z["utility_weights"][0]
+
+    moves_of_all = jax.vmap(move, in_axes=(0, 0, None, None, None))
+    return jax.jit(moves_of_all, compiler_options={"xla_backend_optimization_level": 1})
+
+
+@pytest.fixture(scope="module")
+def one_step():
+    return mover()
+
+
+def p_value_after(move, *, steepness=5.0, scale=1.0, reference=None, model_scale=None, number=100_000):
     """p of the Kolmogorov–Smirnov test that exact draws, moved, still follow the exact law."""
     start, cdf = exact_draws(jax.random.key(1), number, steepness=steepness, scale=scale)
     keys = jax.random.split(jax.random.key(2), number)
-    differences = jnp.array([[1.0], [0.4], [-0.2]])
-    args, kwargs = (differences, Mixed(steepness, 3.0)), {"prior_scale": model_scale or scale}
-
-    @jax.jit
-    def step(key, w):
-        state = kernel.init(key, 0, {"utility_weights": w[None]}, args, kwargs)
-        state = jax.lax.fori_loop(0, moves, lambda _, s: kernel.sample(s, args, kwargs), state)
-        return state.z["utility_weights"][0]
-
-    moved = np.asarray(jax.vmap(step)(keys, jnp.asarray(start)))
+    moved = np.asarray(move(keys, jnp.asarray(start), steepness, model_scale or scale, reference))
     assert np.mean(moved != start) > 0.99
     return stats.kstest(moved, cdf).pvalue
 
@@ -104,13 +123,10 @@ WIDE = (np.array([0.3]), np.array([[0.6]]))
 
 @pytest.mark.parametrize("reference", [None, WIDE], ids=["prior", "reference"])
 @pytest.mark.parametrize(("steepness", "scale"), [(5.0, 1.0), (0.3, 7.0), (60.0, 0.2), (1e4, 1.0)])
-def test_one_step_leaves_the_exact_law_as_it_is(reference, steepness, scale):
+def test_one_step_leaves_the_exact_law_as_it_is(one_step, reference, steepness, scale):
     if reference is not None:
         reference = (reference[0] * scale, reference[1] * scale**2)
-    assert (
-        p_value_after_moves(EllipticalSlice(preference_model, reference=reference), steepness=steepness, scale=scale)
-        > 1e-3
-    )
+    assert p_value_after(one_step, steepness=steepness, scale=scale, reference=reference) > 1e-3
 
 
 def one_candidate_at_a_time(key, v, noise, log_density, *, moves, batch, max_candidates):
@@ -170,12 +186,12 @@ def test_many_moves_in_one_loop_are_the_moves_of_the_textbook_one_by_one(batch, 
 
 
 def test_batched_candidates_leave_the_law_of_a_draw_as_it_is():
-    assert p_value_after_moves(EllipticalSlice(preference_model, batch=1)) > 1e-3
-    assert p_value_after_moves(EllipticalSlice(preference_model, batch=16)) > 1e-3
+    assert p_value_after(mover(batch=1)) > 1e-3
+    assert p_value_after(mover(batch=16)) > 1e-3
 
 
 def test_a_kernel_with_the_prior_scale_five_percent_off_is_rejected():
-    assert p_value_after_moves(EllipticalSlice(preference_model), moves=10, model_scale=1.05) < 1e-6
+    assert p_value_after(mover(moves=10), model_scale=1.05) < 1e-6
 
 
 @pytest.mark.slow
@@ -190,7 +206,7 @@ def test_a_kernel_that_shrinks_to_the_wrong_side_is_rejected(monkeypatch):
         return angles + 1.0, low + 1.0, high + 1.0
 
     monkeypatch.setattr(elliptical_slice, "shrink", wrong)
-    assert p_value_after_moves(EllipticalSlice(preference_model), moves=3) < 1e-6
+    assert p_value_after(mover(moves=3), number=40_000) < 1e-6
 
 
 def test_a_kernel_that_uses_a_key_twice_is_rejected(monkeypatch):
@@ -205,7 +221,7 @@ def test_a_kernel_that_uses_a_key_twice_is_rejected(monkeypatch):
 
     for module in (elliptical_slice, elliptical_slice_kernel):
         monkeypatch.setattr(module, "random", Reused())
-    assert p_value_after_moves(EllipticalSlice(preference_model)) < 1e-6
+    assert p_value_after(mover()) < 1e-6
 
 
 def test_a_reference_without_its_correction_is_rejected(monkeypatch):
@@ -217,7 +233,7 @@ def test_a_reference_without_its_correction_is_rejected(monkeypatch):
 
     right = EllipticalSlice._model_ellipses
     monkeypatch.setattr(EllipticalSlice, "_model_ellipses", uncorrected)
-    assert p_value_after_moves(EllipticalSlice(preference_model, reference=WIDE), moves=3) < 1e-6
+    assert p_value_after(mover(moves=3), reference=WIDE) < 1e-6
 
 
 def ten_dimensions():
