@@ -1,10 +1,9 @@
 """What of the user's goes wrong in the middle of a run is named, and the run on disk goes on once it is mended."""
 
-import gymnasium
-import jax
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Discrete, MultiDiscrete, Tuple
+from gymnasium.spaces import Discrete, MultiDiscrete, Tuple
+from toys import Slope, fingerprint
 
 import bayespbrl
 from bayespbrl import ReturnExpert
@@ -15,30 +14,6 @@ STEPS = 5
 QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": STEPS, "evaluation_episodes": 4, "centres": 20}
 # 10 trajectories of an iteration, then 4 of its evaluation, and so on
 AN_ITERATION = (10 + 4) * STEPS
-
-
-class Slope(gymnasium.Env):
-    """A point pushed along a line; goes wrong at the n-th step of its life if told so."""
-
-    observation_space = Box(-10.0, 10.0, (2,), dtype=np.float64)
-    action_space = Box(-1.0, 1.0, (1,), dtype=np.float64)
-
-    def __init__(self, fault=None, at=None):
-        self.fault, self.at, self.life = fault, at, 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.position = self.np_random.normal(0, 0.1, 2)
-        return self.position.copy(), {}
-
-    def step(self, action):
-        self.life += 1
-        fault = self.fault if self.life == self.at else None
-        if fault == "raises":
-            raise RuntimeError("the motor is on fire")
-        self.position = self.position + 0.3 * float(action[0]) + self.np_random.normal(0, 0.02, 2)
-        seen = np.full(2, np.nan) if fault == "observation" else self.position.copy()
-        return seen, np.nan if fault == "reward" else float(self.position.sum()), False, False, {}
 
 
 def features(states):
@@ -58,16 +33,6 @@ class Faulty:
 
 def own_parts():
     return {"features": features, "policy": LinearGaussianPolicy.initial(Slope.observation_space, Slope.action_space)}
-
-
-def fingerprint(learner):
-    """What must come out the same, bit for bit."""
-    return (
-        [{name: value for name, value in summary.items() if name != "seconds"} for summary in learner.iterations],
-        [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
-        learner.preferences,
-        np.asarray(learner.estimate.weights).tobytes(),
-    )
 
 
 @pytest.fixture(scope="module")

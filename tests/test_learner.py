@@ -3,11 +3,11 @@
 import dataclasses
 import itertools
 
-import gymnasium
 import jax
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Discrete
+from toys import Slope, fingerprint
 
 from bayespbrl import Answer, Learner, ReturnExpert, queries, rollouts
 from bayespbrl import learner as learner_module
@@ -37,23 +37,6 @@ def learner(entries=(), **changes):
 def remembered(**changes):
     log = Memory()
     return learner(**changes).logged(log), log
-
-
-def fingerprint(learner):
-    """Everything that must come out the same, bit for bit."""
-    sampled = None if learner.estimate is None else learner.estimate.sampled
-    posterior = None if sampled is None else sampled.posterior
-    return {
-        "summaries": [{k: v for k, v in s.items() if k != "seconds"} for s in learner.iterations],
-        "policy": [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
-        "trajectories": [
-            (t.states.tobytes(), t.actions.tobytes(), t.rewards.tobytes(), t.terminated) for t in learner.trajectories
-        ],
-        "preferences": learner.preferences,
-        "weights": None if learner.estimate is None else np.asarray(learner.estimate.weights).tobytes(),
-        "draws": None if posterior is None else posterior["posterior"]["coordinates"].values.tobytes(),
-        "question": None if learner.state.query is None else (learner.state.query.first, learner.state.query.second),
-    }
 
 
 class Counting:
@@ -463,27 +446,6 @@ def test_bad_options_are_refused(env, options, message):
         Learner(env, **options)
 
 
-class Slope(gymnasium.Env):
-    """A point pushed along a line for five steps; returns NaN at the n-th step of its life if told so."""
-
-    observation_space = Box(-10.0, 10.0, (1,), dtype=np.float64)
-    action_space = Box(-1.0, 1.0, (1,), dtype=np.float64)
-
-    def __init__(self, break_at=None):
-        self.break_at, self.life, self.position, self.time = break_at, 0, 0.0, 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.position, self.time = self.np_random.normal(0, 0.1), 0
-        return np.array([self.position]), {}
-
-    def step(self, action):
-        self.life, self.time = self.life + 1, self.time + 1
-        self.position += 0.3 * float(np.asarray(action)[0]) + self.np_random.normal(0, 0.02)
-        reward = float("nan") if self.life == self.break_at else self.position
-        return np.array([self.position]), reward, False, self.time >= 5, {}
-
-
 SLOPE = {"utility": "linear-program", "iterations": 2, "max_steps": 5, "evaluation_episodes": 4, "centres": 20}
 
 
@@ -492,7 +454,7 @@ def test_continuous_actions_and_an_ordinary_environment_are_learned_alike():
     changes = {"utility": "known-reward", "iterations": 6, "evaluation_episodes": 20}
     run = Learner(Slope(), policy=policy, **(SLOPE | changes)).run(ReturnExpert())
     assert run.iterations[-1]["value"] > run.iterations[0]["value"]
-    assert run.trajectories[0].states.shape == (6, 1)
+    assert run.trajectories[0].states.shape == (6, 2)
     assert all(np.abs(t.actions).max() <= 1 for t in run.trajectories)
     deviations = [summary["action_standard_deviation"] for summary in run.iterations]
     assert all(len(deviation) == 1 and 0 < deviation[0] < 0.7 for deviation in deviations)
@@ -503,7 +465,7 @@ def test_a_reward_that_is_not_a_number_is_refused_and_the_run_goes_on_without_lo
     # 50 steps are collected, then 20 of evaluation, and so on.
     policy = LinearGaussianPolicy.initial(Slope.observation_space, Slope.action_space, initial_scale=0.3)
     log = Memory()
-    broken = Learner(Slope(break_at), policy=policy, **SLOPE).logged(log)
+    broken = Learner(Slope("reward", break_at), policy=policy, **SLOPE).logged(log)
     with pytest.raises(ValueError, match=r"environment Slope: expected finite .*NaN or infinity at step"):
         broken.run(ReturnExpert())
     assert broken.preferences.answers == answers

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from toys import fingerprint
 
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert
@@ -32,21 +33,6 @@ FILES = {"settings.json", "events.jsonl", "summary.json", "iterations"}
 
 def start(directory, **changes):
     return bayespbrl.start("gridworld", directory, **(QUICK | changes))
-
-
-def fingerprint(learner):
-    """Everything that must come out the same, bit for bit."""
-    posterior = getattr(learner.estimate, "posterior", None)
-    return {
-        "summaries": [{k: v for k, v in s.items() if k != "seconds"} for s in learner.iterations],
-        "policy": [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
-        "trajectories": [
-            (t.states.tobytes(), t.actions.tobytes(), t.rewards.tobytes(), t.terminated) for t in learner.trajectories
-        ],
-        "preferences": learner.preferences,
-        "weights": None if learner.estimate is None else np.asarray(learner.estimate.weights).tobytes(),
-        "draws": None if posterior is None else posterior["posterior"]["coordinates"].values.tobytes(),
-    }
 
 
 def contents(directory):

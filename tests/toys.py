@@ -1,0 +1,47 @@
+"""A toy environment that can go wrong, and the comparison of two learners bit for bit."""
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.spaces import Box
+
+
+class Slope(gymnasium.Env):
+    """A point pushed along a line; goes wrong at the n-th step of its life if told so."""
+
+    observation_space = Box(-10.0, 10.0, (2,), dtype=np.float64)
+    action_space = Box(-1.0, 1.0, (1,), dtype=np.float64)
+
+    def __init__(self, fault=None, at=None):
+        self.fault, self.at, self.life = fault, at, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.position = self.np_random.normal(0, 0.1, 2)
+        return self.position.copy(), {}
+
+    def step(self, action):
+        self.life += 1
+        fault = self.fault if self.life == self.at else None
+        if fault == "raises":
+            raise RuntimeError("the motor is on fire")
+        self.position = self.position + 0.3 * float(action[0]) + self.np_random.normal(0, 0.02, 2)
+        seen = np.full(2, np.nan) if fault == "observation" else self.position.copy()
+        return seen, np.nan if fault == "reward" else float(self.position.sum()), False, False, {}
+
+
+def fingerprint(learner):
+    """Everything of a learner that must come out the same, bit for bit."""
+    sampled = None if learner.estimate is None else learner.estimate.sampled
+    posterior = None if sampled is None else sampled.posterior
+    return {
+        "summaries": [{k: v for k, v in s.items() if k != "seconds"} for s in learner.iterations],
+        "policy": [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
+        "trajectories": [
+            (t.states.tobytes(), t.actions.tobytes(), t.rewards.tobytes(), t.terminated) for t in learner.trajectories
+        ],
+        "preferences": learner.preferences,
+        "weights": None if learner.estimate is None else np.asarray(learner.estimate.weights).tobytes(),
+        "draws": None if posterior is None else posterior["posterior"]["coordinates"].values.tobytes(),
+        "question": None if learner.state.query is None else (learner.state.query.first, learner.state.query.second),
+    }
