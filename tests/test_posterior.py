@@ -1,4 +1,7 @@
+from dataclasses import replace
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -17,7 +20,7 @@ from bayespbrl.models import (
     search_hyperparameters,
     stored,
 )
-from bayespbrl.models.chains import KERNEL, Chains, _ellipses, draw_chunk
+from bayespbrl.models.chains import CHUNK, KERNEL, Chains, _ellipses, draw_chunk
 from bayespbrl.models.convergence import Convergence, chain_convergence
 from bayespbrl.models.likelihoods import Mixed, log_prob
 from bayespbrl.models.low_rank import low_rank
@@ -184,9 +187,9 @@ def test_the_same_seed_gives_the_same_draws(tree):
 
 
 def test_what_does_not_converge_says_so():
-    tree = sample_posterior(consistent(40, 60), num_samples=8, max_samples=16, num_warmup=0)
+    tree = sample_posterior(consistent(40, 60), num_samples=CHUNK, max_samples=2 * CHUNK, num_warmup=0)
     assert not tree.attrs["converged"]
-    assert tree["posterior"].sizes["draw"] == 16
+    assert tree["posterior"].sizes["draw"] == 2 * CHUNK
 
 
 def test_results_are_float64_and_the_global_flag_is_left_alone(tree):
@@ -208,8 +211,9 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
         )
         kernel = EllipticalSlice(low_rank_model)
         z = np.random.default_rng(0).standard_normal((20, len(problem.centre)))
-        joint = np.array([sum(kernel._log_probs({"utility_weights": x}, (problem,), {})) for x in z])
-        likelihood = np.array([kernel._log_probs({"utility_weights": x}, (problem,), {})[1] for x in z])
+        log_probs = jax.vmap(lambda x: jnp.stack(kernel._log_probs({"utility_weights": x}, (problem,), {})))
+        prior_density, likelihood = np.asarray(jax.jit(log_probs)(z)).T
+        joint = prior_density + likelihood
         (reference, _), (prior, _) = _ellipses((problem,), {})
         residual = np.asarray(reference.residual(jax.vmap(reference.lift)(z)))
         inside = stats.multivariate_normal(problem.centre, problem.root @ problem.root.T).logpdf(z)
@@ -223,15 +227,9 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
 def test_numpyros_mcmc_gives_the_same_draws_as_the_compiled_loop():
     fit = fit_gaussian(consistent(6, 9), PreferenceModel())
     with jax.enable_x64(True):
-        chains = Chains.start(fit, num_chains=2, chunk=5, seed=0)
-        mcmc = MCMC(
-            KERNEL,
-            num_warmup=0,
-            num_samples=5,
-            num_chains=2,
-            chain_method="vectorized",
-            progress_bar=False,
-        )
+        chains = Chains.start(fit, num_chains=4, chunk=CHUNK, seed=0)
+        options = {"num_chains": 4, "chain_method": "vectorized", "progress_bar": False}
+        mcmc = MCMC(KERNEL, num_warmup=0, num_samples=5, **options)
         mcmc.post_warmup_state = chains.state
         mcmc.run(chains.state.rng_key, chains.problem)
         z = mcmc.get_samples(group_by_chain=True)
@@ -243,13 +241,11 @@ def test_chains_started_in_the_far_tail_forget_it():
     differences = consistent(20, 40)
     fit = fit_gaussian(differences, PreferenceModel())
     with jax.enable_x64(True):
-        chains = Chains.start(fit, num_chains=4, chunk=100, seed=0)
-        far = {
-            "utility_weights": np.asarray(chains.state.z["utility_weights"]) * 0 + np.array([[30], [-30], [8], [-8]])
-        }
-        state, _, _ = draw_chunk(chains.state._replace(z=far), chains.problem, length=100)
-        _, states, _ = draw_chunk(state, chains.problem, length=1000)
-    margins = np.asarray(states.z["utility_weights"])[:, :, :20] @ fit.factors.loadings.T
+        chains = Chains.start(fit, num_chains=4, chunk=CHUNK, seed=0)
+        far = chains.state.z["utility_weights"] * 0 + jnp.array([[30.0], [-30.0], [8.0], [-8.0]])
+        chains = replace(chains, state=chains.state._replace(z={"utility_weights": far}))
+        chains = replace(chains.extended(100), draws=()).extended(1000)
+    margins = chains.collected("coordinates", 1000) @ fit.factors.loadings.T
     expected = sample_posterior(differences, num_samples=4000)["posterior/margins"].values
     error = np.hypot(chain_convergence(margins).monte_carlo_error, chain_convergence(expected).monte_carlo_error)
     assert chain_convergence(margins).rhat_max < 1.02
