@@ -1,12 +1,15 @@
 """Densities and how to sample them.
 
-likelihoods              what an answer says about a margin: eq. 8, lapses, Bradley-Terry, probit, ties
-preference_model         eq. 7 in NumPyro, and the ellipses that make it fast to sample
-elliptical_slice         the kernel, for any NumPyro model with Gaussian priors
-low_rank                 the part of the utility that the answers can see
-expectation_propagation  the Gaussian that the ellipses go round, and the evidence
-posterior                all of these together: chains until they have converged, as a DataTree
-hyperparameters          length scale, prior scale, steepness: what the answers speak for
+preference_model         σ, m, λ, likelihood and ties in one object; eqs. 7-8 in NumPyro
+likelihoods              the probability of an answer given a margin: eq. 8, lapses, Bradley-Terry, probit, ties
+elliptical_slice         the kernel's textbook algorithm; elliptical_slice_kernel is the kernel for NumPyro
+low_rank                 the part of the utility that the answers determine
+expectation_propagation  a Gaussian close to the posterior, and the marginal likelihood
+gaussian_fit             both of these for given answers
+preference_problem       the model in low rank, and the ellipses that sample it fast; chains runs them
+posterior                draws until the chains have converged; posterior_tree has them in ArviZ's schema
+convergence              R̂, effective sample size and Monte Carlo error
+hyperparameters          length scales, prior scale and steepness by marginal likelihood
 linear_program           eq. 10, the alternative to the posterior
 """
 

@@ -1,11 +1,11 @@
 """Expectation propagation: a Gaussian close to the posterior of z given margins t = L z, and its evidence (Minka 2001).
 
-Each answer's factor p_k(t_k) is replaced by a Gaussian in t_k; all factors are updated at once, damped. It is done in
-NumPy because it is a handful of small dense factorisations, once for each fit.
+Each answer's factor p_k(t_k) is replaced by a Gaussian in t_k; all factors are updated at once, damped. NumPy is fast
+enough: a fit is a handful of small dense factorisations.
 
-Answers about the same margin up to a number, as when two trajectories are compared again, are one factor, whose moments
-are found by quadrature. Gaussians of their own would each be fitted to what the others leave, and of twelve answers for
-and four against a margin those of the four alone may be left.
+Answers about the same margin up to a factor, as when two trajectories are compared again, share one Gaussian, whose
+moments are found by quadrature. With a Gaussian each, every one would be fitted to what the others leave, and of twelve
+answers for and four against a margin only those of the four might remain.
 """
 
 from dataclasses import dataclass

@@ -34,8 +34,7 @@ class HyperparameterSearch:
     @property
     def weights(self) -> Float[np.ndarray, " c"]:
         """p(setting | answers) of each under a uniform prior; they sum to 1."""
-        weights: Float[np.ndarray, " c"] = np.exp(self.log_evidence - logsumexp(self.log_evidence))
-        return weights
+        return np.asarray(np.exp(self.log_evidence - logsumexp(self.log_evidence)))
 
 
 def search_hyperparameters(

@@ -1,8 +1,8 @@
-"""What an answer says about a margin t = d(w, k, ζ): the preference likelihoods (eq. 8 and its relatives).
+"""The probability of an answer given its margin t = d(w, k, ζ): the preference likelihoods (eq. 8 and its relatives).
 
 Every likelihood here is a constant plus a mixture of probits, p(t) = c + Σⱼ aⱼ Φ((t − oⱼ)/hⱼ): a step is h = 0, and the
 logistic function is a scale mixture of normal distribution functions (Andrews & Mallows 1974: scale 2κ, κ Kolmogorov
-distributed). So one closed form serves expectation propagation for all of them, at any steepness.
+distributed). Expectation propagation has one closed form for all of them, at any steepness.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float, Int
 
 LIKELIHOODS = ("mixed", "logistic", "probit")  # names of those that have neither lapses nor ties
 Scalar = float | Float[Array, ""]  # a number, or what JAX makes of it where it traces a function
-Margins = Float[Array, "*b k"] | Float[np.ndarray, "*b k"]
+Values = Float[Array, "*b k"]  # one for each margin
+Margins = Values | Float[np.ndarray, "*b k"]
 
 
 class ProbitMixture(NamedTuple):
@@ -32,7 +33,7 @@ class ProbitMixture(NamedTuple):
     scales: Float[np.ndarray, " j"]
 
     def of(self, rows: Bool[np.ndarray, " k"] | Int[np.ndarray, " n"]) -> "ProbitMixture":
-        """That of some of the answers; the same where all are of one kind."""
+        """The mixture of some of the answers; the same where all are of one kind."""
         if np.ndim(self.weights) == 1:
             return self
         return self._replace(constant=np.asarray(self.constant)[rows], weights=self.weights[rows])
@@ -42,7 +43,7 @@ class ProbitMixture(NamedTuple):
 class Likelihood(Protocol):
     """The probability of the answer that was given, as a function of its margin; a JAX pytree."""
 
-    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
+    def factor(self, margins: Margins) -> tuple[Values, Values]:
         """(e, q) with p(answer | t) = exp(e) q, elementwise, e ≤ 0 and q never much below 1/(2K).
 
         The product of the q over some dozens of answers cannot underflow, so their logarithm is taken once.
@@ -54,7 +55,7 @@ class Likelihood(Protocol):
         ...
 
 
-def log_prob(likelihood: Likelihood, margins: Margins) -> Float[Array, "*b k"]:
+def log_prob(likelihood: Likelihood, margins: Margins) -> Values:
     """log p(answer | t), elementwise; JAX-traceable, in the dtype of `margins`."""
     exponent, ratio = likelihood.factor(margins)
     return exponent + jnp.log(ratio)
@@ -63,8 +64,7 @@ def log_prob(likelihood: Likelihood, margins: Margins) -> Float[Array, "*b k"]:
 def prob(likelihood: Likelihood, margins: Float[np.ndarray, "*b k"]) -> Float[np.ndarray, "*b k"]:
     """p(answer | t), elementwise, in float64."""
     with jax.enable_x64(True):
-        probabilities: Float[np.ndarray, "*b k"] = np.exp(np.asarray(_log_prob(likelihood, margins)))
-    return probabilities
+        return np.asarray(np.exp(np.asarray(_log_prob(likelihood, margins))))
 
 
 _log_prob = jax.jit(log_prob)
@@ -112,14 +112,13 @@ class Mixed:
     steepness: Scalar
     number_of_preferences: Scalar
 
-    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
+    def factor(self, margins: Margins) -> tuple[Values, Values]:
         """exp(min(m t, 0)) times a ratio between 1/(2K) and 1."""
         scaled = self.steepness * margins
         decay = jnp.exp(-jnp.abs(scaled))
         share = 1 / self.number_of_preferences
         above = 1 + decay * (1 - share)
-        # at 0 the step is ½; a NaN margin makes `decay` NaN and stays NaN
-        # eq. 8, its step and its sigmoid at once
+        # eq. 8; at 0 the step is ½; a NaN margin makes `decay` NaN and stays NaN
         return jnp.minimum(scaled, 0), jnp.where(margins > 0, above, jnp.where(margins < 0, share, 1.0)) / (1 + decay)
 
     def probit_mixture(self) -> ProbitMixture:
@@ -136,7 +135,7 @@ class Logistic:
 
     steepness: Scalar
 
-    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
+    def factor(self, margins: Margins) -> tuple[Values, Values]:
         """exp(min(m t, 0)) / (1 + exp(−|m t|))."""
         scaled = self.steepness * margins
         return jnp.minimum(scaled, 0), 1 / (1 + jnp.exp(-jnp.abs(scaled)))
@@ -154,7 +153,7 @@ class Probit:
 
     steepness: Scalar
 
-    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
+    def factor(self, margins: Margins) -> tuple[Values, Values]:
         """Φ(m t) itself is the exponential of its logarithm."""
         exponent = jax.scipy.special.log_ndtr(self.steepness * margins)
         return exponent, jnp.ones_like(exponent)
@@ -170,15 +169,15 @@ class WithLapses:
     """A constant share of coin tosses around any likelihood: λ/2 + (1 − λ) p, so 20 % wrong answers are λ = 0.4.
 
     Attributes:
-      attentive: the likelihood p of an answer that is no coin toss.
+      attentive: the likelihood p of an answer that is not a coin toss.
       lapse_rate: λ in (0, 1).
     """
 
     attentive: Mixed | Logistic | Probit
     lapse_rate: Scalar
 
-    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
-        """The larger of both terms' exponents is taken out."""
+    def factor(self, margins: Margins) -> tuple[Values, Values]:
+        """e is the larger exponent of both terms."""
         exponent, ratio = self.attentive.factor(margins)
         floor = jnp.log(self.lapse_rate / 2)
         top = jnp.maximum(exponent, floor)
@@ -208,8 +207,8 @@ class WithTies:
     threshold: Scalar
     indifferent: Bool[Array, " k"] | Bool[np.ndarray, " k"]
 
-    def factor(self, margins: Margins) -> tuple[Float[Array, "*b k"], Float[Array, "*b k"]]:
-        """The last axis of `margins` is K."""
+    def factor(self, margins: Margins) -> tuple[Values, Values]:
+        """q = 1: the logarithms of both terms of a tie are needed."""
         preferred = log_prob(self.ordered, margins - self.threshold)
         # p(tie) is symmetric: at −|t| both terms are small and their difference keeps its relative precision
         upper = log_prob(self.ordered, self.threshold - jnp.abs(margins))

@@ -1,4 +1,4 @@
-"""The part of the utility that the answers can see: Ψ = L Qᵀ, w = Q z + complement (thin factorisation).
+"""The part of the utility that the answers determine: Ψ = L Qᵀ, w = Q z + complement (thin factorisation).
 
 The likelihood depends on w only through the margins t = Ψ w = L z with z = Qᵀ w ~ N(0, σ²I_r), r = rank Ψ ≤ K. What is
 orthogonal to Q keeps its prior: its draws are exact prior noise and its posterior mean is exactly zero.
@@ -38,7 +38,7 @@ def low_rank(differences: Float[np.ndarray, "k d"]) -> LowRank:
     loadings, basis = np.zeros((len(differences), 0)), np.zeros((differences.shape[1], 0))
     if not used.any():
         return LowRank(loadings, basis)
-    # QR first: its cost in D is that of one matrix product, and the decomposition that tells the rank is only (K, K)
+    # QR first: its cost in D is that of one matrix product, and the decomposition that finds the rank is only (K, K)
     directions, triangle = np.linalg.qr((differences[used] / lengths[used, None]).T)
     left, values, right = np.linalg.svd(triangle.T)
     rank = int(np.sum(values > values[0] * max(differences.shape) * np.finfo(float).eps))
@@ -49,15 +49,14 @@ def low_rank(differences: Float[np.ndarray, "k d"]) -> LowRank:
 
 def used_rows(loadings: Float[np.ndarray, "k r"]) -> Bool[np.ndarray, " k"]:
     """Which answers carry information: the rows of L that are not exactly zero."""
-    used: Bool[np.ndarray, " k"] = np.any(loadings != 0, axis=1)
-    return used
+    return np.asarray(np.any(loadings != 0, axis=1))
 
 
 class UtilityWeights(BackendArray):
     """Draws of w = Q z + σ (I − QQᵀ) ε, of shape (chain, draw, feature), computed where they are indexed.
 
-    ε comes from a counter-based generator keyed by the seed, the chain and the draw: the same draw is the same array
-    however it is reached.
+    ε comes from a counter-based generator keyed by the seed, the chain and the draw, so that a draw is the same array
+    however it is indexed.
     """
 
     def __init__(
@@ -95,5 +94,4 @@ class UtilityWeights(BackendArray):
         # twice: one projection leaves a rounding error of the size of the margins' smallest directions
         for _ in range(2):
             noise -= self.basis @ (self.basis.T @ noise)
-        weights: Float[np.ndarray, " d"] = self.basis @ self.coordinates[chain, draw] + noise
-        return weights
+        return np.asarray(self.basis @ self.coordinates[chain, draw] + noise)

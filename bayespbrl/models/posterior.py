@@ -1,4 +1,4 @@
-"""Step 1, Bayesian PBIRL: draws from p(w | preferences) that have converged, or say that they have not (eqs. 7-8)."""
+"""Step 1, Bayesian PBIRL: draws from p(w | preferences), with their convergence (eqs. 7-8)."""
 
 from dataclasses import dataclass, replace
 
@@ -16,7 +16,7 @@ from bayespbrl.models.preference_model import PreferenceModel
 
 @dataclass(frozen=True)
 class SamplerOptions:
-    """How long the chains are; attributes as the keywords of `sample_posterior`."""
+    """Number and length of the chains; attributes as the keywords of `sample_posterior`."""
 
     num_warmup: int = 25
     num_samples: int = 250
@@ -48,8 +48,9 @@ def sample_posterior(
 ) -> xr.DataTree:
     """Draw from the posterior of the utility weights w ~ N(0, σ²I) given preferences (eqs. 7-8), until it converges.
 
-    After `num_samples` draws a chain, and after every doubling, R̂ ≤ 1.01 and at least 400 effective draws are asked of
-    every margin; what has not met them at `max_samples` says `converged = 0`. Everything is computed in float64.
+    The chains have converged when every margin has R̂ ≤ 1.01 and at least 400 effective draws. This is checked after
+    `num_samples` draws a chain and after every doubling; where it is not met at `max_samples`, `converged` is 0.
+    Everything is computed in float64.
 
     Args:
       differences: ψ(preferred) − ψ(dominated), shape (K, D), used as given: divide by a scale of your choice first.
@@ -62,16 +63,16 @@ def sample_posterior(
         does not matter.
       tie_threshold: δ > 0: margins within it are often called ties. None: no ties, and no threshold.
       number_of_preferences: K of eq. 8, where it is not the number of rows (an answer held out).
-      num_warmup: draws a chain that are thrown away; rounded up to whole chunks of min(num_samples, 25) draws.
+      num_warmup: draws a chain that are discarded (burn-in); rounded up to whole chunks of min(num_samples, 25) draws.
       num_samples: draws a chain to begin with, >= 4.
       max_samples: cap on the draws a chain.
       num_chains: >= 2, so that R̂ means something.
-      seed: of everything random; the same seed gives the same draws.
+      seed: the same seed gives the same draws.
 
     Returns:
       A tree with the groups
       `posterior`: margins (chain, draw, preference), coordinates z (chain, draw, coordinate), and utility_weights
-        (chain, draw, feature), which is computed where it is indexed and held nowhere;
+        (chain, draw, feature), which are computed when indexed;
       `sample_stats`: lp (log likelihood), candidates (per move), stuck, diverging (a likelihood of zero or NaN);
       `log_likelihood`: answers (chain, draw, preference); `observed_data`: answers, 1 as given and 0 for a tie;
       `constant_data`: differences;
@@ -104,7 +105,7 @@ def posterior_draws(
     number_of_preferences: int | None = None,
     sampler: SamplerOptions | None = None,
 ) -> xr.DataTree:
-    """`sample_posterior` for a model that is at hand; `sampler` None takes the default `SamplerOptions`."""
+    """`sample_posterior` with its options in objects; `sampler` None for the default `SamplerOptions`."""
     seed = checks.whole("seed", seed, 0)
     sampler = SamplerOptions() if sampler is None else sampler
     fit = fit_gaussian(differences, model, indifferent=indifferent, number_of_preferences=number_of_preferences)

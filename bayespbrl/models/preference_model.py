@@ -26,16 +26,18 @@ from bayespbrl.models.likelihoods import (
 
 @dataclass(frozen=True)
 class PreferenceModel:
-    """Prior and likelihood of the posterior (eqs. 7-8): w ~ N(0, σ²I), and p(answer | margin t = wᵀ difference).
+    """Prior and likelihood (eqs. 7-8): w ~ N(0, σ²I), and the probability of an answer given its margin t = wᵀψ.
 
-    σ and m have units: those of the differences that the model is used with. Only σ·m matters for the probabilities.
+    Differences ψ have the unit of the features; the learner divides them by their largest absolute entry. Without ties
+    the answers depend on σ·m alone.
 
     Attributes:
-      prior_scale: σ > 0, the standard deviation of each weight.
-      steepness: m > 0, the slope of the sigmoid in the margin.
+      prior_scale: σ > 0, standard deviation of each weight, in utility per feature.
+      steepness: m > 0, slope of the sigmoid, in 1/utility.
       lapse_rate: λ in [0, 1), the probability that an answer is a coin toss.
       likelihood: "mixed" (eq. 8), "logistic" (Bradley-Terry) or "probit" (Thurstone).
-      tie_threshold: δ > 0: margins within it are often answered with "no difference". None: such answers never occur.
+      tie_threshold: δ > 0, in utility: margins within it are often answered with "no difference". None: there are no
+        such answers.
     """
 
     prior_scale: float = 1.0
@@ -57,11 +59,11 @@ class PreferenceModel:
 
         Args:
           number_of_preferences: K of eq. 8.
-          indifferent: which answers were "no difference", bool, one entry for each margin; needs `tie_threshold`. None:
-            one for each of the K preferences, all False.
+          indifferent: which answers were "no difference", bool, one entry for each margin; needs `tie_threshold`. None
+            for K answers of which none was.
 
         Raises:
-          ValueError: indifferent answers without a tie threshold, or `indifferent` that is no vector of bool.
+          ValueError: indifferent answers without a tie threshold, or an `indifferent` that is not a vector of bool.
         """
         steepness = float(self.steepness)
         likelihood: Mixed | Logistic | Probit | WithLapses
