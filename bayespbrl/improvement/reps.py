@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from bayespbrl import checks
 
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
-RANK_TOLERANCE = 1e-3
+RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
 CONSTANT = "constant Q: nothing to gain"
 

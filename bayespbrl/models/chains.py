@@ -26,7 +26,7 @@ from bayespbrl.models.preference_problem import (
 # posterior's bulk and its residual has no bound in the tails; with none of it the reference is the prior, which mixes
 # badly.
 REFERENCE_POWER = 0.5
-# Moves round the reference's and the prior's ellipses per recorded draw; more round the prior's help in the tails.
+# Moves around the reference's and the prior's ellipses per recorded draw; those around the prior's help in the tails.
 REFERENCE_MOVES, PRIOR_MOVES = 26, 6
 # Draws that one call of the compiled sampler makes; its length is part of what is compiled.
 CHUNK = 25
@@ -64,7 +64,7 @@ class Chains:
             mean=approximation.mean,
             site_precisions=site_precisions,
         )
-        # from the reference, which is wider than the posterior's bulk: those that agree have forgotten their start
+        # the reference is wider than the posterior's bulk: chains that agree have forgotten their start
         noise = np.random.default_rng(seed).standard_normal((num_chains, len(problem.centre)))
         start = np.asarray(problem.centre) + noise @ np.asarray(problem.root).T
         zeros = jnp.zeros(num_chains)
@@ -76,23 +76,16 @@ class Chains:
     @property
     def length(self) -> int:
         """Draws a chain so far."""
-        return sum(len(part["lp"][0]) for part in self.draws)
+        return sum(len(part["stuck"][0]) for part in self.draws)
 
     def extended(self, more: int) -> "Chains":
         """At least `more` draws longer."""
         draws, state = list(self.draws), self.state
         for _ in range(-(-more // self.chunk)):
             state, states, answers = draw_chunk(state, self.problem, length=self.chunk)
-            draws.append(
-                {
-                    "coordinates": np.asarray(states.z["utility_weights"])[:, :, : self.rank],
-                    "answers": np.asarray(answers)[:, :, : self.number],
-                    "lp": np.asarray(states.log_likelihood),
-                    "candidates": np.asarray(states.candidates),
-                    "stuck": np.asarray(states.stuck),
-                    "diverging": np.asarray(states.diverging),
-                }
-            )
+            z, log_p = np.asarray(states.z["utility_weights"]), np.asarray(answers)
+            flags = {name: np.asarray(getattr(states, name)) for name in ("candidates", "stuck", "diverging")}
+            draws.append({"coordinates": z[:, :, : self.rank], "answers": log_p[:, :, : self.number], **flags})
         return replace(self, state=state, draws=tuple(draws))
 
     def collected(self, name: str, length: int) -> Shaped[np.ndarray, "chain {length} ..."]:

@@ -64,15 +64,15 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
 
     Args:
       model: a NumPyro model.
-      moves: moves round an ellipse per recorded draw.
+      moves: moves around an ellipse per recorded draw.
       batch: candidate points evaluated at once; more where evaluations are cheap. The law of the draws is the same.
       max_candidates: cap on the candidates of a move, rounded up to whole batches; a move that meets it stays and the
         state says `stuck`.
       reference: (mean (n,), covariance (n, n)) of a Gaussian over the latent sites, flattened in the order of their
         sorted names. Half of the moves, at least one, then go round its ellipses and the rest, at least one, round the
-        prior's, whose tails no narrower reference can be trusted with. The covariance must be positive definite.
+        prior's, because chains of a narrower reference stick in the tails. The covariance must be positive definite.
       ellipses: (model_args, model_kwargs) ↦ [(Ellipse, moves), ...], instead of those made from the model. For models
-        that know a cheaper residual; it is on the caller that it is the model's density.
+        that know a cheaper residual; the caller ensures that it is the model's density.
       log_likelihood: (z, model_args, model_kwargs) ↦ the state's log likelihood, where that is cheaper than the model.
     """
 
@@ -120,7 +120,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         model_args: Args = (),
         model_kwargs: Keywords | None = None,
     ) -> EllipticalSliceState:
-        """State at `init_params` (values of latent sites), and at a draw from the prior where they say nothing."""
+        """State at `init_params` (values of latent sites), and at a draw from the prior for all other sites."""
         model_kwargs = {} if model_kwargs is None else model_kwargs
         if not is_prng_key(rng_key):
             return jax.vmap(lambda key, params: self.init(key, num_warmup, params, model_args, model_kwargs))(
@@ -141,9 +141,8 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
             z[name] = jnp.asarray(value, dtype=z[name].dtype)
         log_likelihood = self._log_likelihood(z, model_args, model_kwargs)
         one = jnp.ones_like(log_likelihood)
-        return EllipticalSliceState(
-            z, log_likelihood, one, jnp.zeros((), bool), ~jnp.isfinite(log_likelihood), key_state
-        )
+        no = jnp.zeros((), bool)
+        return EllipticalSliceState(z, log_likelihood, one, no, ~jnp.isfinite(log_likelihood), key_state)
 
     def sample(
         self, state: EllipticalSliceState, model_args: Args = (), model_kwargs: Keywords | None = None
@@ -204,7 +203,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         root = jnp.linalg.cholesky(covariance)
 
         def residual(v: Float[Array, " n"]) -> Float[Array, ""]:
-            # log prior × likelihood / reference, up to a constant (Nishihara, Murray & Adams 2014, section 3.1)
+            # log prior × likelihood / reference, up to a constant (Nishihara, Murray & Adams 2014, section 3)
             log_prior, log_likelihood = self._log_probs(unravel(mean + root @ v), model_args, model_kwargs)
             return log_prior + log_likelihood + 0.5 * jnp.sum(v**2)
 
@@ -269,9 +268,8 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         """From the latent sites to these and the model's deterministic ones."""
 
         def fn(z: Values) -> Values:
-            sites = trace(substitute(seed(self._model, random.key(0)), data=z)).get_trace(
-                *model_args, **(model_kwargs or {})
-            )
+            model = substitute(seed(self._model, random.key(0)), data=z)
+            sites = trace(model).get_trace(*model_args, **(model_kwargs or {}))
             found = {name: site["value"] for name, site in sites.items() if site["type"] == "deterministic"}
             return {**z, **found}
 
@@ -289,7 +287,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         return state._replace(log_likelihood=log_likelihood, diverging=~jnp.isfinite(log_likelihood))
 
     def wrap_model(self, wrapper: Callable[[Callable[..., Any]], Callable[..., Any]]) -> "EllipticalSlice":
-        """A copy of this kernel with another model; ellipses made by hand for the old one do not survive."""
+        """A copy of this kernel with another model; `ValueError` where it has ellipses of the caller's."""
         if self._ellipses is not None:
             raise ValueError("ellipses: a kernel with its own ellipses cannot follow another model")
         kernel = copy.copy(self)
