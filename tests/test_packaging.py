@@ -20,7 +20,11 @@ def built(tmp_path_factory):
     """Wheel and sdist, built from a copy of the checkout by the build back end that pyproject.toml asks for."""
     folder = tmp_path_factory.mktemp("build")
     source, back_end = folder / "source", folder / "back end"
-    left_out = shutil.ignore_patterns(".venv", ".git", ".*_cache", "runs", "build", "dist", "__pycache__", "*.egg-info")
+    anywhere = shutil.ignore_patterns(".venv*", ".git", ".*_cache", "build", "dist", "__pycache__", "*.egg-info")
+
+    def left_out(folder, names):  # `runs` of the checkout's root, and not the package of that name
+        return anywhere(folder, names) | ({"runs"} if Path(folder) == ROOT else set())
+
     shutil.copytree(ROOT, source, symlinks=True, ignore=left_out)
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--target", str(back_end)]
     subprocess.run([*pip, "setuptools>=77"], check=True)
