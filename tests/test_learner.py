@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import json
 
 import jax
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from gymnasium.spaces import Discrete
 from toys import Slope, fingerprint
 
-from bayespbrl import Answer, Learner, ReturnExpert, queries, rollouts
+from bayespbrl import Answer, Learner, ReturnExpert, load, queries, resume, rollouts, start
 from bayespbrl import learner as learner_module
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.improvement.schedules import Bound
@@ -593,3 +594,22 @@ def test_the_gridworld_is_learned_from_preferences():
     run = Learner("gridworld", iterations=12, seed=1000, evaluation_episodes=50).run(ReturnExpert())
     assert run.iterations[-1]["value"] > 3 * 44.34  # of the uniform policy
     assert all(summary["rhat_max"] < 1.01 for summary in run.iterations if summary["utility_converged"])
+
+
+def newest_first(situation):
+    return sorted(situation.new, reverse=True)
+
+
+def test_a_run_follows_a_query_rule_of_the_users_own_and_goes_on_with_it(tmp_path):
+    begun = start("gridworld", tmp_path / "run", query=newest_first, **QUICK)
+    while len(begun.iterations) < 2:
+        begun.tell([ReturnExpert()(*query.trajectories) for query in begun.ask()])
+    with pytest.raises(ValueError, match=r"a run with query of the user's own: expected it again as query="):
+        resume(tmp_path / "run")
+    whole = resume(tmp_path / "run", query=newest_first).run(ReturnExpert())
+    asked = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    newcomers = [event["newcomer"] for event in asked if event["event"] == "asked"]
+    assert newcomers[2:] == [19, 29]
+    assert load(tmp_path / "run").iterations == whole.iterations  # reading needs no rule
+    with pytest.raises(ValueError, match="query: expected a function of the user's own beside 'other', got none"):
+        Learner("gridworld", query="other")
