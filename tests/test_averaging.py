@@ -39,6 +39,7 @@ def averaged(features, trajectories, pairs, *, likelihood="logistic", seed=0):
     return average_utility(sampled, comparisons, features, model=model, seed=seed)
 
 
+@pytest.mark.slow
 def test_the_pairs_that_it_satisfies_are_counted_by_the_average_and_not_by_the_likeliest_setting():
     trajectories = walks(7)
     for seed in range(40):
@@ -53,6 +54,7 @@ def test_the_pairs_that_it_satisfies_are_counted_by_the_average_and_not_by_the_l
     pytest.fail("no case in which the two differ")
 
 
+@pytest.mark.slow
 def test_mean_and_spread_are_those_of_the_mixture_by_importance_sampling():
     # The posterior over (setting, weights) by weighing draws of the prior by the likelihood: no Gaussian, no evidence.
     trajectories, rng = walks(5), np.random.default_rng(0)
@@ -104,6 +106,7 @@ def test_a_trajectory_is_worth_the_sum_of_its_states_in_the_mean_and_in_every_dr
         estimate.utilities_and_draws(states, number=0)[1]
 
 
+@pytest.mark.slow
 def test_mean_and_draws_in_one_pass_are_those_of_two():
     trajectories = walks()
     comparisons = Comparisons.among(trajectories, PAIRS, discount=1.0)
@@ -144,6 +147,7 @@ def test_of_many_dimensions_some_length_scales_are_taken():
     assert set(estimate.multiples.flat) <= set(BANDWIDTH_MULTIPLES)
 
 
+@pytest.mark.slow
 def test_a_run_keeps_the_average(tmp_path):
     learner = start("swing-up", tmp_path / "run", iterations=2, centres=20, **ALL, **QUICK)
     learner.run(ReturnExpert())
@@ -164,6 +168,7 @@ def learner_report(directory):
     return write_report(directory).read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sure", [0.0, 1.1])
 def test_an_unsure_learner_asks_for_information_about_all_that_was_never_shown(sure):
     run = Learner("swing-up", iterations=4, centres=20, **(ALL | {"query": InformationWhenUnsure(sure)}), **QUICK)
@@ -190,6 +195,7 @@ def test_an_unsure_learner_asks_for_information_about_all_that_was_never_shown(s
     assert (old > 0) == (sure > 1)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_tells_nothing_and_is_not_asked_again():
     run = Learner("gridworld", iterations=3, **ALL, **(QUICK | {"hyperparameters": "given"}))
     skipped = []

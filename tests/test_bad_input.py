@@ -87,6 +87,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("at", "completed"),
     [(3, 0), (10 * STEPS + 3, 0), (AN_ITERATION + 3, 1), (AN_ITERATION + 10 * STEPS + 3, 1)],

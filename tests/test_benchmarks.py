@@ -70,6 +70,7 @@ def test_the_seconds_of_the_steps_of_a_trial_add_up():
     assert all(any(f"  {step} " in row for row in table) for step in steps)
 
 
+@pytest.mark.slow
 def test_a_schedule_costs_what_updates_with_it_take_longer(printed):
     result = json.loads(printed("schedule", "gridworld", "--iterations", "1")[0])
     assert 0 < result["updates_without"] < result["seconds_without"]

@@ -56,6 +56,7 @@ def unpictured(monkeypatch):
     monkeypatch.setattr("bayespbrl.diagnostics.plots.run_figure", lambda learner: mock.Mock())
 
 
+@pytest.mark.slow
 def test_run_leaves_a_run_directory_with_a_picture_and_says_where(finished):
     out, shown = finished
     assert "answers" in shown
@@ -66,6 +67,7 @@ def test_run_leaves_a_run_directory_with_a_picture_and_says_where(finished):
     assert [entry["answers"] for entry in json.loads((out / "summary.json").read_text())["iterations"]] == [2, 3]
 
 
+@pytest.mark.slow
 def test_a_run_in_an_environment_that_cannot_be_rendered_finishes_and_says_so(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     options = [*SHORT, "--iterations", "1", "--centres", "10"]
@@ -222,6 +224,7 @@ def test_a_truncated_iteration_file_is_named(monkeypatch, capsys, tmp_path, fini
     assert file.stat().st_size == 1000
 
 
+@pytest.mark.slow
 def test_the_module_runs_as_a_program():
     result = subprocess.run(
         [sys.executable, "-m", "bayespbrl", "run", "nowhere"], capture_output=True, text=True, check=False

@@ -32,6 +32,7 @@ def comparison():
     return compare_likelihoods(ROWS, CANDIDATES, folds=5, **SAMPLING)
 
 
+@pytest.mark.slow
 def test_leaving_out_one_at_a_time_agrees_with_quadrature_and_eq_8_keeps_the_full_number_of_preferences(comparison):
     likelihoods = {
         "sure": lambda t: expit(60 * t),

@@ -62,6 +62,7 @@ def run(kernel, *args, chain_method="vectorized", num_warmup=200, num_samples=20
     return mcmc
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "reference", [None, (np.array([0.0, 1.0, 0.0]), np.diag([0.3, 0.5, 0.4]))], ids=["prior", "reference"]
 )
@@ -121,6 +122,7 @@ def p_value_after(move, *, steepness=5.0, scale=1.0, reference=None, model_scale
 WIDE = (np.array([0.3]), np.array([[0.6]]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reference", [None, WIDE], ids=["prior", "reference"])
 @pytest.mark.parametrize(("steepness", "scale"), [(5.0, 1.0), (0.3, 7.0), (60.0, 0.2), (1e4, 1.0)])
 def test_one_step_leaves_the_exact_law_as_it_is(one_step, reference, steepness, scale):
@@ -155,6 +157,7 @@ def one_candidate_at_a_time(key, v, noise, log_density, *, moves, batch, max_can
     return v, tried, stuck
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("batch", "max_candidates"), [(1, 1000), (4, 1000), (3, 10), (1, 6), (8, 8)])
 def test_many_moves_in_one_loop_are_the_moves_of_the_textbook_one_by_one(batch, max_candidates):
     moves, centre, width = 12, np.array([0.7, -0.4]), 0.003
@@ -185,11 +188,13 @@ def test_many_moves_in_one_loop_are_the_moves_of_the_textbook_one_by_one(batch, 
         assert any(0 < number < moves for number in given_up)
 
 
+@pytest.mark.slow
 def test_batched_candidates_leave_the_law_of_a_draw_as_it_is():
     assert p_value_after(mover(batch=1)) > 1e-3
     assert p_value_after(mover(batch=16)) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_kernel_with_the_prior_scale_five_percent_off_is_rejected():
     assert p_value_after(mover(moves=10), model_scale=1.05) < 1e-6
 
@@ -209,6 +214,7 @@ def test_a_kernel_that_shrinks_to_the_wrong_side_is_rejected(monkeypatch):
     assert p_value_after(mover(moves=3), number=40_000) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_kernel_that_uses_a_key_twice_is_rejected(monkeypatch):
     from bayespbrl.models import elliptical_slice, elliptical_slice_kernel
 
@@ -224,6 +230,7 @@ def test_a_kernel_that_uses_a_key_twice_is_rejected(monkeypatch):
     assert p_value_after(mover()) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_reference_without_its_correction_is_rejected(monkeypatch):
     def uncorrected(self, x, unravel, key, model_args, model_kwargs):
         ellipses = right(self, x, unravel, key, model_args, model_kwargs)
@@ -280,6 +287,7 @@ def test_chain_methods_give_the_same_draws():
     np.testing.assert_allclose(draws["parallel"], draws["vectorized"], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_run_continued_equals_one_long_run():
     long = run(EllipticalSlice(regression), X, Y, num_warmup=10, num_samples=40)
     short = run(EllipticalSlice(regression), X, Y, num_warmup=10, num_samples=20)
@@ -290,6 +298,7 @@ def test_a_run_continued_equals_one_long_run():
     np.testing.assert_allclose(both, long.get_samples(group_by_chain=True)["slope"], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_arviz_reads_sites_deterministics_and_extra_fields():
     mcmc = run(EllipticalSlice(regression), X, Y, num_samples=50, extra_fields=("candidates", "stuck"))
     tree = from_numpyro(mcmc)
@@ -323,6 +332,7 @@ def test_scale_and_steepness_are_inferred_beside_w_by_gibbs_as_by_nuts_alone():
         assert np.all(np.abs(a.mean((0, 1)) - b.mean((0, 1))) < 4.5 * error), site
 
 
+@pytest.mark.slow
 def test_a_start_where_the_likelihood_is_zero_or_nan_is_left():
     def model():
         x = numpyro.sample("x", dist.Normal(0, 1))
@@ -335,6 +345,7 @@ def test_a_start_where_the_likelihood_is_zero_or_nan_is_left():
         assert np.all(np.abs(mcmc.get_samples()["x"]) <= 1)
 
 
+@pytest.mark.slow
 def test_a_move_without_an_acceptable_candidate_stays_and_says_so():
     def model():
         x = numpyro.sample("x", dist.Normal(0, 1).expand([2]).to_event(1))
@@ -378,6 +389,7 @@ def test_bad_arguments_are_named():
         EllipticalSlice(regression).init(jax.random.key(0), 0, {"nope": jnp.zeros(2)}, (X, Y), {})
 
 
+@pytest.mark.slow
 def test_single_precision_programs_keep_their_precision():
     with jax.enable_x64(False):
         mcmc = run(EllipticalSlice(regression), X.astype(np.float32), Y.astype(np.float32), num_samples=10)

@@ -123,6 +123,7 @@ def test_swing_up_starts_hanging_give_or_take_a_fifth():
     assert np.all(starts[:, 1] == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("policy", "published", "tolerance"),
     [
@@ -178,6 +179,7 @@ def test_bicycle_reward_and_fall_at_twelve_degrees():
     assert not bool(bicycle.DYNAMICS.terminal(upright))
 
 
+@pytest.mark.slow
 def test_bicycle_noise_is_on_the_displacement_only_and_actions_are_clipped():
     keys = jax.random.split(jax.random.key(0), 500)
     state = jnp.array([0.1, 0.2, 0.03, -0.1])
@@ -187,6 +189,7 @@ def test_bicycle_noise_is_on_the_displacement_only_and_actions_are_clipped():
     assert lowest <= after[:, 3].min() < after[:, 3].max() <= highest
 
 
+@pytest.mark.slow
 def test_bicycle_random_policy_falls_in_a_third_of_the_episodes():
     result = evaluate("bicycle", uniform(bicycle.DYNAMICS), episodes=10_000)
     assert result.total.mean() == pytest.approx(-40, abs=3)
@@ -203,6 +206,7 @@ def test_bicycle_linear_law_survives_fifty_steps():
     assert np.mean(~result.terminated) > 0.99
 
 
+@pytest.mark.slow
 def test_bicycle_balancing_time_is_measured_beyond_fifty_steps():
     result = evaluate("bicycle", Linear(STEER_INTO_THE_FALL), episodes=200, max_steps=3000)
     assert result.steps.max() == 3000

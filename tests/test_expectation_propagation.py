@@ -54,6 +54,7 @@ def test_one_answer_is_exact(likelihood):
     np.testing.assert_allclose(fit.covariance[0] * 0.64, variance, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("likelihood", "tolerance"), [(Mixed(5.0, 3.0), 0.2), (Probit(2.0), 0.02), (Logistic(5.0), 0.05)]
 )

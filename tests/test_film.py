@@ -59,6 +59,7 @@ def frames_of(path):
     return shown
 
 
+@pytest.mark.slow
 def test_an_environment_that_can_be_drawn_leaves_a_film_and_a_strip(tmp_path, monkeypatch):
     monkeypatch.setattr("bayespbrl.runs.film.FRAMES", 6)  # each takes a tenth of a second
     film, strip = film_policy(Learner("gridworld", max_steps=20, **QUICK), tmp_path)

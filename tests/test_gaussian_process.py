@@ -191,6 +191,7 @@ def test_the_initial_policy_is_one_normal_distribution():
     np.testing.assert_allclose(policy.mean_and_variance(states)[0], 10.0)
 
 
+@pytest.mark.slow
 def test_the_search_finds_the_noise_and_a_good_length_scale():
     rng = np.random.default_rng(13)
     points = rng.uniform(-4, 4, (2000, 2))
@@ -287,6 +288,7 @@ def test_a_constant_observation_dimension_changes_nothing():
     np.testing.assert_array_equal(policy.mean_and_variance(points), policy.mean_and_variance(elsewhere))
 
 
+@pytest.mark.slow
 def test_repeated_fits_to_own_samples_neither_lose_nor_gain_exploration():
     rng = np.random.default_rng(19)
     states = some_samples(1000, rng)[0]

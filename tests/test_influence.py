@@ -19,6 +19,7 @@ def steep():
     return sample_posterior(CONTRADICTED, steepness=40.0, **SAMPLING)
 
 
+@pytest.mark.slow
 def test_the_answer_that_contradicts_the_others_is_the_most_influential_and_the_least_probable():
     tree = sample_posterior(CONTRADICTED, likelihood="logistic", **SAMPLING)
     every = influence(tree, refits=None, **SAMPLING)
@@ -36,6 +37,7 @@ def test_the_answer_that_contradicts_the_others_is_the_most_influential_and_the_
     assert np.all(np.delete(means.values, 4) > 0)
 
 
+@pytest.mark.slow
 def test_without_an_answer_the_means_are_those_by_quadrature():
     rows = np.array([[0.7], [-0.4], [0.9]])
     tree = sample_posterior(rows, likelihood="logistic", prior_scale=1.5, **SAMPLING)
@@ -55,6 +57,7 @@ def test_without_an_answer_the_means_are_those_by_quadrature():
         np.testing.assert_allclose(result["margin_means"][k], rows[:, 0] * mean(w, weights), atol=0.08)
 
 
+@pytest.mark.slow
 def test_importance_weights_and_refits_agree_where_k_hat_is_low():
     tree = sample_posterior(CONTRADICTED[:4], likelihood="logistic", steepness=2.0, **SAMPLING)
     result = influence(tree, refits=None, **SAMPLING)
@@ -73,6 +76,7 @@ def test_refits_are_of_the_answers_with_the_largest_estimated_change(steep):
     np.testing.assert_array_equal(some["converged"], refitted)
 
 
+@pytest.mark.slow
 def test_a_row_of_zeros_has_no_influence():
     rows = np.vstack([CONTRADICTED[:2], np.zeros((1, 2))])
     tree = sample_posterior(rows, **SAMPLING)
@@ -111,6 +115,7 @@ def test_without_answers_there_is_none_to_leave_out():
     assert plot_influence(result, axes) is axes
 
 
+@pytest.mark.slow
 def test_the_figure_shows_every_answer_and_the_k_hat_of_those_above_the_limit(steep):
     result = influence(steep, refits=2, **FEW)
     figure = Figure()

@@ -51,6 +51,7 @@ class Counting:
         return ReturnExpert()(first, second)
 
 
+@pytest.mark.slow
 def test_twenty_five_iterations_take_twenty_six_answers():
     expert = Counting()
     run = learner(iterations=25, evaluation_episodes=1, max_steps=10).run(expert)
@@ -131,6 +132,7 @@ def test_more_questions_an_iteration_are_asked_one_after_the_other():
     assert [summary["answers"] for summary in run.iterations] == [4, 7, 10]
 
 
+@pytest.mark.slow
 def test_without_a_signal_as_many_iterations_ask_nothing_as_is_allowed_but_no_more_than_half_the_answers():
     run, log = remembered(iterations=8, unasked_iterations=2)
     run.run(ReturnExpert())
@@ -391,6 +393,7 @@ def test_a_summary_says_how_the_iteration_went():
         assert all(seconds > 0 for seconds in summary["seconds"].values())
 
 
+@pytest.mark.slow
 def test_the_learner_follows_the_expert_and_not_the_hidden_reward():
     # This expert wants the bottom left corner, where the environment's reward is smallest.
     wish = REWARDS[::-1, ::-1].ravel()
@@ -476,6 +479,7 @@ def test_a_reward_that_is_not_a_number_is_refused_and_the_run_goes_on_without_lo
     assert fingerprint(broken.run(ReturnExpert())) == fingerprint(whole)  # it broke only once
 
 
+@pytest.mark.slow
 def test_discrete_actions_in_continuous_states_are_learned():
     run = Learner("CartPole-v1", utility="linear-program", iterations=2, centres=20, evaluation_episodes=2)
     assert isinstance(run.environment.action_space, Discrete)
@@ -523,6 +527,7 @@ def test_answers_have_a_discount_of_their_own(monkeypatch):
     assert learner(iterations=1, discount=0.9).run(ReturnExpert()).estimate.discount == 0.9
 
 
+@pytest.mark.slow
 def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch):
     problems = seen_problems(monkeypatch)
     options = {"iterations": 3, "max_steps": 12, "centres": 20, "evaluation_episodes": 2, "utility": "linear-program"}
@@ -561,6 +566,7 @@ def test_the_bound_of_an_iteration_is_decided_once_and_followed_by_several_updat
     assert fingerprint(again) == fingerprint(often)
 
 
+@pytest.mark.slow
 def test_compilations_do_not_grow_with_the_iterations():
     assert compilations_after(learner(iterations=1, max_steps=11), 0) > 0  # the counter counts
     assert compilations_after(learner(iterations=7, max_steps=11), 3) == 0

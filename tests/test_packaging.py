@@ -57,6 +57,7 @@ def test_the_sdist_holds_no_link_and_no_second_copy(built):
     assert {"pyproject.toml", "README.md", "LICENSE", "bayespbrl/py.typed", *TEMPLATES} <= inner
 
 
+@pytest.mark.slow
 def test_an_installed_package_puts_no_models_diagnostics_or_envs_on_the_path(tmp_path):
     command = f"import importlib.util as u, bayespbrl; print([n for n in {LINKS} if u.find_spec(n)])"
     done = subprocess.run([sys.executable, "-c", command], cwd=tmp_path, capture_output=True, text=True, check=True)

@@ -123,6 +123,7 @@ def test_a_row_depends_on_the_key_and_its_number_alone(kind, fitted):
     assert not np.array_equal(many[:7], sample_actions(fitted, jax.random.key(3), observations[:7]))
 
 
+@pytest.mark.slow
 def test_neither_the_number_of_observations_nor_a_new_fit_compiles_anything(kind):
     rng = np.random.default_rng(5)
     policy, sizes = initial(kind), []
@@ -377,6 +378,7 @@ def test_the_linear_noise_keeps_to_its_floor():
     np.testing.assert_allclose(policy.action_standard_deviation(observations)[0], 0.02 * np.array([4.0, 10.0]))
 
 
+@pytest.mark.slow
 def test_gaussian_kl_divergence_agrees_with_quadrature():
     def policy(mean, deviation):
         return replace(

@@ -51,6 +51,7 @@ def test_low_rank_keeps_zero_rows_at_zero_and_small_rows_at_their_size():
     np.testing.assert_allclose(factors.loadings[3] @ factors.basis.T, differences[3], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [9, 26])
 def test_answers_that_contradict_each_other_about_the_same_margin_are_sampled_exactly(number):
     # 5 for and 3 against a margin, beside one about another: the steps of eq. 8, which have no scale, decide; with
@@ -89,6 +90,7 @@ def test_one_preference_gives_the_sigmoid():
     np.testing.assert_allclose(tree.attrs["log_evidence"], np.log(0.5), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_two_dimensions_agree_with_quadrature():
     differences = np.array([[1.0, 0.3], [0.5, -1.0], [-0.2, 0.4], [1.0, 0.3]])
     tree = sample_posterior(differences, prior_scale=1.3, steepness=4.0, num_samples=4000)
@@ -118,6 +120,7 @@ def test_zero_rows_have_margin_zero_and_factor_one_half():
     assert only.attrs["converged"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("likelihood", ["mixed", "logistic", "probit"])
 def test_duplicate_and_contradictory_answers_are_fine(likelihood):
     row = consistent(1, 5)
@@ -186,6 +189,7 @@ def test_the_same_seed_gives_the_same_draws(tree):
     assert not np.any(other["posterior/margins"].values == tree["posterior/margins"].values)
 
 
+@pytest.mark.slow
 def test_what_does_not_converge_says_so():
     tree = sample_posterior(consistent(40, 60), num_samples=CHUNK, max_samples=2 * CHUNK, num_warmup=0)
     assert not tree.attrs["converged"]
@@ -198,6 +202,7 @@ def test_results_are_float64_and_the_global_flag_is_left_alone(tree):
     assert np.abs(tree["posterior/margins"].values.astype(np.float32) - tree["posterior/margins"].values).max() > 0
 
 
+@pytest.mark.slow
 def test_ellipses_of_the_low_rank_problem_have_the_models_density():
     differences = consistent(6, 9)
     fit = fit_gaussian(differences, PreferenceModel(prior_scale=1.7))
@@ -224,6 +229,7 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
         )
 
 
+@pytest.mark.slow
 def test_numpyros_mcmc_gives_the_same_draws_as_the_compiled_loop():
     fit = fit_gaussian(consistent(6, 9), PreferenceModel())
     with jax.enable_x64(True):
@@ -237,6 +243,7 @@ def test_numpyros_mcmc_gives_the_same_draws_as_the_compiled_loop():
         np.testing.assert_allclose(z["margins"][:, :, :6], margins, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_chains_started_in_the_far_tail_forget_it():
     differences = consistent(20, 40)
     fit = fit_gaussian(differences, PreferenceModel())

@@ -84,6 +84,7 @@ def test_without_answers_the_prior_predicts_and_no_chain_is_run(monkeypatch):
     assert converged
 
 
+@pytest.mark.slow
 def test_a_refit_without_some_answers_keeps_the_full_number_of_preferences_and_the_model():
     tree = sample_posterior(KNOWN, steepness=3.0, prior_scale=0.7, seed=4, **SAMPLING)
     others = refit(tree, np.array([True, False]), **SAMPLING)

@@ -128,6 +128,7 @@ def changed(contents, changes):
 # What the report says.
 
 
+@pytest.mark.slow
 def test_the_report_is_one_file_that_fetches_nothing_and_changes_nothing_else(gridworld_run, drawn):
     before = files(gridworld_run)
     path = write_report(gridworld_run)
