@@ -1,6 +1,6 @@
 """The warnings of a report, each with its remedy."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
@@ -24,82 +24,67 @@ def find_warnings(
     """What is not in order, most serious first."""
     found = list(contents.damage)
     if contents.features_missing:
-        found.append(
-            ReportWarning(
-                f"The run's state features are a function of your own, and {contents.features_missing}. The utility of "
-                "states and the probability of each answer before it was given are missing here.",
-                "Call bayespbrl.load(directory, features=...).report() with the function of the run.",
-            )
+        what = (
+            f"The run's state features are a function of your own, and {contents.features_missing}. The utility of "
+            "states and the probability of each answer before it was given are missing here."
         )
+        remedy = "Call bayespbrl.load(directory, features=...).report() with the function of the run."
+        found.append(ReportWarning(what, remedy))
     if iterations.sizes["iteration"]:
-        found += _of_fits(contents, iterations) + _of_updates(iterations)
-        found += _of_entropy(contents, iterations) + _of_value(iterations)
-    return found + _of_answers(contents, answers) + _of_predictions(scores)
+        found += [*_of_fits(contents, iterations), *_of_updates(iterations), *_of_fitted_policy(iterations)]
+        found += [*_of_entropy(contents, iterations), *_of_value(iterations)]
+    return [*found, *_of_answers(contents, answers), *_of_predictions(scores)]
 
 
-def _of_fits(contents: RunContents, table: xr.Dataset) -> list[ReportWarning]:
+def _of_fits(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarning]:
     failed = table["iteration"].values[table["utility_converged"].values == 0]
-    if not failed.size:
-        return []
-    last = "The last fit is among them. " if failed[-1] == table.sizes["iteration"] else ""
-    if contents.settings.estimation.utility == "linear-program":
-        return [ReportWarning(f"The linear program failed in {_which(failed)}.", "Its status is in summary.json.")]
-    return [
-        ReportWarning(
+    if failed.size and contents.settings.estimation.utility == "linear-program":
+        yield ReportWarning(f"The linear program failed in {_which(failed)}.", "Its status is in summary.json.")
+    elif failed.size:
+        last = "The last fit is among them. " if failed[-1] == table.sizes["iteration"] else ""
+        yield ReportWarning(
             f"The posterior did not converge in {_which(failed)}. {last}Uncertainties there are unreliable, and so are "
             "the policy updates that followed.",
             "Look at the rank plots. The usual reason is answers that contradict each other. A lapse rate above zero "
             "(--lapse-rate 0.1) or a lower --steepness softens them.",
         )
-    ]
 
 
-def _of_updates(table: xr.Dataset) -> list[ReportWarning]:
-    found, iteration = [], table["iteration"].values
-    if (failed := iteration[table["reps_converged"].values == 0]).size:
-        found.append(
-            ReportWarning(
-                f"REPS did not converge in {_which(failed)}: the policy was left unchanged.",
-                "Fewer centres (--centres) or a smaller --kl-bound make the dual easier to solve.",
-            )
+def _of_updates(table: xr.Dataset) -> Iterator[ReportWarning]:
+    iteration, failed = table["iteration"].values, table["reps_converged"].values == 0
+    if failed.any():
+        yield ReportWarning(
+            f"REPS did not converge in {_which(iteration[failed])}: the policy was left unchanged.",
+            "Fewer centres (--centres) or a smaller --kl-bound make the dual easier to solve.",
         )
-    solved = table["reps_converged"].values != 0
-    if (idle := iteration[(table["bound_active"].values == 0) & solved]).size:
-        found.append(
-            ReportWarning(
-                f"The KL bound was inactive in {_which(idle)}: no admissible policy was as far away as allowed.",
-                "Harmless once the policy is good and has no more to gain. If the value is poor, the utility no longer "
-                "distinguishes the actions: ask more questions, or use a policy with more entropy.",
-            )
+    if (idle := iteration[(table["bound_active"].values == 0) & ~failed]).size:
+        yield ReportWarning(
+            f"The KL bound was inactive in {_which(idle)}: no admissible policy was as far away as allowed.",
+            "Harmless once the policy is good and has no more to gain. If the value is poor, the utility no longer "
+            "distinguishes the actions: ask more questions, or use a policy with more entropy.",
         )
-    return found + _of_fitted_policy(table)
 
 
-def _of_fitted_policy(table: xr.Dataset) -> list[ReportWarning]:
+def _of_fitted_policy(table: xr.Dataset) -> Iterator[ReportWarning]:
     """The KL of the fitted policy against the KL that REPS reached."""
-    found, iteration = [], table["iteration"].values
+    iteration = table["iteration"].values
     # of several updates the policy's KL is that of all together, and REPS' own that of the last alone
     several = table["updates"].values > 1
     fitted, reached = table["kl_fitted_policy"].values, np.where(several, table["kl_bound"], table["kl"])
     if (far := iteration[fitted > 3 * np.maximum(reached, 0.01)]).size:
-        found.append(
-            ReportWarning(
-                f"The fitted policy moved more than three times as far as REPS asked for in {_which(far)}.",
-                "The bound does not hold there. Try another kind of policy (--policy) or a smaller --kl-bound.",
-            )
+        yield ReportWarning(
+            f"The fitted policy moved more than three times as far as REPS asked for in {_which(far)}.",
+            "The bound does not hold there. Try another kind of policy (--policy) or a smaller --kl-bound.",
         )
     if (near := iteration[(fitted < reached / 3) & (reached > 0.02)]).size > 0.2 * len(iteration):
-        found.append(
-            ReportWarning(
-                f"The fitted policy moved less than a third as far as REPS asked for in {_which(near)}.",
-                "The policy smooths the update. Harmless while the value rises. A larger --kl-bound moves it further"
-                + (", and so do more updates (--updates-per-iteration 3)." if not several.any() else "."),
-            )
+        yield ReportWarning(
+            f"The fitted policy moved less than a third as far as REPS asked for in {_which(near)}.",
+            "The policy smooths the update. Harmless while the value rises. A larger --kl-bound moves it further"
+            + (", and so do more updates (--updates-per-iteration 3)." if not several.any() else "."),
         )
-    return found
 
 
-def _of_entropy(contents: RunContents, table: xr.Dataset) -> list[ReportWarning]:
+def _of_entropy(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarning]:
     first, last = float(table["entropy"][0]), float(table["entropy"][-1])
     space = None if contents.environment is None else contents.environment.action_space
     if isinstance(space, Discrete):
@@ -107,74 +92,56 @@ def _of_entropy(contents: RunContents, table: xr.Dataset) -> list[ReportWarning]
     else:
         size = 1 if space is None else int(np.prod(space.shape or ()))
         collapsed = first - last > ENTROPY_LOST * size
-    if not collapsed:
-        return []
-    return [
-        ReportWarning(
+    if collapsed:
+        yield ReportWarning(
             f"The policy's entropy collapsed, from {first:.2f} to {last:.2f} nats: it hardly explores any more.",
             "Right if the value is good. Otherwise the policy settled too early: a smaller --kl-bound narrows it more "
             "slowly. Another --seed shows whether it was chance.",
         )
-    ]
 
 
-def _of_value(table: xr.Dataset) -> list[ReportWarning]:
+def _of_value(table: xr.Dataset) -> Iterator[ReportWarning]:
     value = table["value"].values
-    if len(value) < 3 or np.isnan(value).any() or np.max(value) - value[-1] <= 0.15 * (np.max(value) - np.min(value)):
-        return []
-    best = int(np.argmax(value))
-    return [
-        ReportWarning(
+    if len(value) >= 3 and np.max(value) - value[-1] > 0.15 * np.ptp(value):  # no comparison holds for an unknown one
+        best = int(np.argmax(value))
+        yield ReportWarning(
             f"The value has fallen from {number(value[best])} (iteration {best + 1}) to {number(value[-1])}.",
             "Either the evaluation is noisy or an update was too large: look at the KL, and try a smaller --kl-bound.",
         )
-    ]
 
 
-def _of_answers(contents: RunContents, answers: xr.Dataset) -> list[ReportWarning]:
-    found, question = [], answers["question"].values
-    against = question[answers["margin"].values < 0]
-    if against.size:
-        found.append(
-            ReportWarning(
-                f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
-                "See the pictures below. If these answers are mistakes, allow for them with --lapse-rate 0.1 (now "
-                f"{contents.model.lapse_rate:g}). If they are right, the features cannot express what matters: use "
-                "more centres or features of your own.",
-            )
+def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWarning]:
+    question = answers["question"].values
+    if (against := question[answers["margin"].values < 0]).size:
+        yield ReportWarning(
+            f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
+            "See the pictures below. If these answers are mistakes, allow for them with --lapse-rate 0.1 (now "
+            f"{contents.model.lapse_rate:g}). If they are right, the features cannot express what matters: use "
+            "more centres or features of your own.",
         )
-    surprising = question[answers["before"].values < SURPRISING]
-    if surprising.size:
-        found.append(
-            ReportWarning(
-                f"{count(surprising.size, 'answer was', 'answers were')} surprising (probability below {SURPRISING:g} "
-                f"beforehand): {_list(surprising)}.",
-                "Some surprises are expected: one in ten predictions of 0.9 fails. The pictures show whether these "
-                "answers were mistakes.",
-            )
+    if (surprising := question[answers["before"].values < SURPRISING]).size:
+        yield ReportWarning(
+            f"{count(surprising.size, 'answer was', 'answers were')} surprising (probability below {SURPRISING:g} "
+            f"beforehand): {_list(surprising)}.",
+            "Some surprises are expected: one in ten predictions of 0.9 fails. The pictures show whether these "
+            "answers were mistakes.",
         )
     ties = sum(answer.answer is Answer.TIE for answer in contents.answers)
     if ties > 0.3 * max(3, len(contents.answers)):
-        found.append(
-            ReportWarning(
-                f"{ties} of {len(contents.answers)} answers were ties, from which the posterior learns nothing.",
-                "Longer or more different trajectories are easier to tell apart.",
-            )
+        yield ReportWarning(
+            f"{ties} of {len(contents.answers)} answers were ties, from which the posterior learns nothing.",
+            "Longer or more different trajectories are easier to tell apart.",
         )
-    return found
 
 
-def _of_predictions(scores: xr.Dataset) -> list[ReportWarning]:
+def _of_predictions(scores: xr.Dataset) -> Iterator[ReportWarning]:
     limit = float(scores["log_score_expected"] - 2 * scores["log_score_sd"])
-    if scores.sizes["prediction"] < ENOUGH_PREDICTIONS or not float(scores["log_score"]) < limit:
-        return []
-    return [
-        ReportWarning(
+    if scores.sizes["prediction"] >= ENOUGH_PREDICTIONS and float(scores["log_score"]) < limit:
+        yield ReportWarning(
             "The predictions were overconfident: their log score is more than two standard deviations below its "
             "expectation.",
             "A lapse rate, a lower --steepness or smoother features make them less certain.",
         )
-    ]
 
 
 def _which(iterations: np.ndarray) -> str:
