@@ -4,13 +4,14 @@ import inspect
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, TypedDict, Unpack, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
 from bayespbrl import checks, runs
 from bayespbrl.cli.display import PICTURE, console, progress_bar, run_to_the_end, show_run, show_trials
 from bayespbrl.runs.directory import fresh_directory
+from bayespbrl.settings import OPTIONS, PARTS, Settings
 from bayespbrl.studies import run_trials
 
 app = typer.Typer(
@@ -23,82 +24,44 @@ app = typer.Typer(
 Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot, or any gymnasium id.")]
 
 
-class RunOptions(TypedDict, total=False):
-    """Options of a run and of each trial. An option left out has the value of the environment's preset."""
-
-    utility: Annotated[
-        str | None,
-        typer.Option(
-            help="Estimate of the utility: posterior-mean, most-likely, posterior-draw, linear-program, or "
-            "known-reward (a reference run trained on the hidden reward)."
-        ),
-    ]
-    query: Annotated[
-        str | None,
-        typer.Option(
-            help="Rule that selects the trajectories to ask about: highest-utility (the paper's), probably-better, "
-            "thompson, information, disagreement or information-when-unsure."
-        ),
-    ]
-    schedule: Annotated[
-        str | None,
-        typer.Option(
-            help="KL bound of each update: constant (the paper's), or confidence, which scales it with the posterior's "
-            "confidence that the update is an improvement."
-        ),
-    ]
-    hyperparameters: Annotated[
-        str | None,
-        typer.Option(
-            help="Length scales, steepness and lapse rate: evidence (by marginal likelihood), averaged (over length "
-            "scales and steepness, weighted by marginal likelihood) or given (as set)."
-        ),
-    ]
-    iterations: Annotated[int | None, typer.Option(help="Number of cycles of the four steps.")]
-    kl_bound: Annotated[float | None, typer.Option(help="KL bound of each policy update, in nats.")]
-    updates_per_iteration: Annotated[
-        int | None, typer.Option(help="Maximum number of policy updates per iteration; the paper's is 1.")
-    ]
-    unasked_iterations: Annotated[
-        int | None,
-        typer.Option(
-            help="Maximum number of consecutive iterations without a question (at most half the answers so far); with "
-            "the schedule confidence only while its confidence is high; the paper's is 0."
-        ),
-    ]
-    likelihood: Annotated[str | None, typer.Option(help="Likelihood of an answer: mixed (eq. 8), logistic or probit.")]
-    prior_scale: Annotated[float | None, typer.Option(help="Prior standard deviation of each utility weight.")]
-    steepness: Annotated[
-        float | None, typer.Option(help="Steepness of the likelihood, for feature differences scaled to at most 1.")
-    ]
-    lapse_rate: Annotated[float | None, typer.Option(help="Share of answers modelled as coin tosses, in [0, 1).")]
-    discount: Annotated[float | None, typer.Option(help="Discount of Q, in [0, 1); the paper's is 0.98.")]
-    trajectory_discount: Annotated[
-        float | None,
-        typer.Option(help="Discount of the trajectory features, in [0, 1]; the paper's is that of Q."),
-    ]
-    wrong_answers: Annotated[
-        float | None, typer.Option(help="Share of the simulated expert's answers that are reversed, in [0, 1].")
-    ]
-    policy: Annotated[
-        str | None, typer.Option(help="Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.")
-    ]
-    centres: Annotated[int | None, typer.Option(help="Number of radial basis functions of each kind of feature.")]
-    max_steps: Annotated[
-        int | None, typer.Option(help="Maximum steps per episode; the environment's limit if omitted.")
-    ]
-    expert: Annotated[str | None, typer.Option(help="Who answers: return (simulated) or terminal (you).")]
+# The options of a run and of each trial, with their help. One left out has the value of the environment's preset.
+RUN_OPTIONS = {
+    "utility": "Estimate of the utility: posterior-mean, most-likely, posterior-draw, linear-program, or known-reward "
+    "(a reference run trained on the hidden reward).",
+    "query": "Rule that selects the trajectories to ask about: highest-utility (the paper's), probably-better, "
+    "thompson, information, disagreement or information-when-unsure.",
+    "schedule": "KL bound of each update: constant (the paper's), or confidence, which scales it with the posterior's "
+    "confidence that the update is an improvement.",
+    "hyperparameters": "Length scales, steepness and lapse rate: evidence (by marginal likelihood), averaged (over "
+    "length scales and steepness, weighted by marginal likelihood) or given (as set).",
+    "iterations": "Number of cycles of the four steps.",
+    "kl_bound": "KL bound of each policy update, in nats.",
+    "updates_per_iteration": "Maximum number of policy updates per iteration; the paper's is 1.",
+    "unasked_iterations": "Maximum number of consecutive iterations without a question (at most half the answers so "
+    "far); with the schedule confidence only while its confidence is high; the paper's is 0.",
+    "likelihood": "Likelihood of an answer: mixed (eq. 8), logistic or probit.",
+    "prior_scale": "Prior standard deviation of each utility weight.",
+    "steepness": "Steepness of the likelihood, for feature differences scaled to at most 1.",
+    "lapse_rate": "Share of answers modelled as coin tosses, in [0, 1).",
+    "discount": "Discount of Q, in [0, 1); the paper's is 0.98.",
+    "trajectory_discount": "Discount of the trajectory features, in [0, 1]; the paper's is that of Q.",
+    "wrong_answers": "Share of the simulated expert's answers that are reversed, in [0, 1].",
+    "policy": "Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.",
+    "centres": "Number of radial basis functions of each kind of feature.",
+    "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
+    "expert": "Who answers: return (simulated) or terminal (you).",
+}
 
 
 def _takes_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """`command` with a parameter for each of its `**options`, as Typer requires."""
-    parameters = inspect.signature(command).parameters.values()
-    named = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
-    options = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
-        for name, kind in get_type_hints(RunOptions, include_extras=True).items()
-    ]
-    vars(command)["__signature__"] = inspect.Signature([named[0], *options, *named[1:]])
+    """`command` with a parameter for each of `RUN_OPTIONS`, of the type that its part of the settings has."""
+    env, *named = (p for p in inspect.signature(command).parameters.values() if p.kind is not p.VAR_KEYWORD)
+    options = []
+    for name, text in RUN_OPTIONS.items():
+        kind = get_type_hints(PARTS.get(OPTIONS[name], Settings))[name] | None
+        given = {"default": None, "annotation": Annotated[kind, typer.Option(help=text)]}
+        options.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, **given))
+    vars(command)["__signature__"] = inspect.Signature([env, *options, *named])
     return command
 
 
@@ -109,7 +72,7 @@ def run(
     *,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Run directory; a new one under runs/ if omitted.")] = None,
-    **options: Unpack[RunOptions],
+    **options: Any,
 ) -> None:
     """Learn a task from preferences; the run is kept in a directory."""
     _check_expert(options.get("expert"))
@@ -150,7 +113,7 @@ def trials(
     jobs: Annotated[int, typer.Option(help="Number of trials at a time, each in its own process.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the first trial.")] = 1000,
     out: Annotated[Path | None, typer.Option(help="Directory of the study; under runs/ if omitted.")] = None,
-    **options: Unpack[RunOptions],
+    **options: Any,
 ) -> None:
     """Run many seeds and print median and quartiles of the value; finished trials are not repeated."""
     checks.whole("trials", number)
