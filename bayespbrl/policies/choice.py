@@ -1,5 +1,7 @@
 """Which kind of policy suits an environment's spaces."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from gymnasium import Space
@@ -39,18 +41,13 @@ def initial_policy(
             kind = "gaussian-process"
         else:
             kind = "tabular" if isinstance(observation_space, Discrete) else "softmax"
-    match kind:
-        case "tabular":
-            least = LEAST_EXPLORATION / getattr(action_space, "n", 1)
-            return TabularPolicy.initial(observation_space, action_space, minimum_probability=float(least))
-        case "softmax":
-            return SoftmaxPolicy.initial(observation_space, action_space, period=period)
-        case "linear-gaussian":
-            return LinearGaussianPolicy.initial(observation_space, action_space, initial_scale=action_scale)
-        case "gaussian-process":
-            return GaussianProcessPolicy.initial(
-                observation_space, action_space, period=period, initial_scale=action_scale
-            )
-    raise ValueError(
-        f"policy: expected auto, tabular, softmax, linear-gaussian or gaussian-process to start from, got {kind!r}"
-    )
+    least = float(LEAST_EXPLORATION / getattr(action_space, "n", 1))
+    kinds: dict[str, Callable[..., Policy]] = {
+        "tabular": partial(TabularPolicy.initial, minimum_probability=least),
+        "softmax": partial(SoftmaxPolicy.initial, period=period),
+        "linear-gaussian": partial(LinearGaussianPolicy.initial, initial_scale=action_scale),
+        "gaussian-process": partial(GaussianProcessPolicy.initial, period=period, initial_scale=action_scale),
+    }
+    if kind not in kinds:
+        raise ValueError(f"policy: expected auto, {', '.join(kinds)} to start from, got {kind!r}")
+    return kinds[kind](observation_space, action_space)

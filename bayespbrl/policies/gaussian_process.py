@@ -12,19 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import Space
 from jax import Array
-from jaxtyping import Bool, Float, Int, Key, Shaped
+from jaxtyping import Bool, Float, Int, Key
 from numpy.typing import ArrayLike
 
+from bayespbrl import kernels
 from bayespbrl.checks import matrix, positive, whole
-from bayespbrl.kernels import (
-    as_periods,
-    coordinates,
-    inverse_bandwidths,
-    median_bandwidths,
-    radial_basis,
-    radial_basis_row,
-    squared_exponential,
-)
 from bayespbrl.policies.hyperparameter_search import Hyperparameters, OutputSamples, SearchResult, search
 from bayespbrl.policies.policy import AnyArray
 from bayespbrl.policies.samples import weighted_samples
@@ -101,7 +93,7 @@ class GaussianProcessPolicy:
             noise_variance=variance,
             action_centre=centre,
             action_range=width,
-            period=as_periods(period, states),
+            period=kernels.as_periods(period, states),
             minimum_noise=np.asarray(positive("minimum_noise", minimum_noise)),
             fits=np.asarray(0),
             objective=np.full(actions, np.nan),
@@ -112,20 +104,15 @@ class GaussianProcessPolicy:
         """Mean and variance of each action dimension at one observation, traceable. O(AM²)."""
 
         def one(
-            points: Float[Array, "m s"],
-            bandwidths: Float[Array, " s"],
-            mean_weights: Float[Array, " m"],
-            reduction: Float[Array, "m m"],
+            points: Float[AnyArray, "m s"],
+            bandwidths: Float[AnyArray, " s"],
+            mean_weights: Float[AnyArray, " m"],
+            reduction: Float[AnyArray, "m m"],
         ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-            correlations = radial_basis_row(jnp.asarray(observation), points, bandwidths, self.period)
+            correlations = kernels.radial_basis_row(jnp.asarray(observation), points, bandwidths, self.period)
             return correlations @ mean_weights, jnp.sum(jnp.square(reduction @ correlations))
 
-        mean, explained = jax.vmap(one)(
-            jnp.asarray(self.inducing_points),
-            jnp.asarray(self.bandwidths),
-            jnp.asarray(self.mean_weights),
-            jnp.asarray(self.reduction),
-        )
+        mean, explained = jax.vmap(one)(self.inducing_points, self.bandwidths, self.mean_weights, self.reduction)
         variance = jnp.asarray(self.signal_variance) * jnp.maximum(1.0 - explained, 0.0) + self.noise_variance
         return jnp.asarray(self.action_centre) + mean, variance
 
@@ -150,7 +137,7 @@ class GaussianProcessPolicy:
         for points, bandwidths, mean_weights, reduction in zip(
             *map(np.asarray, (self.inducing_points, self.bandwidths, self.mean_weights, self.reduction)), strict=True
         ):
-            correlations = radial_basis(observations, points, bandwidths, np.asarray(self.period))
+            correlations = kernels.radial_basis(observations, points, bandwidths, np.asarray(self.period))
             means.append(correlations @ mean_weights)
             explained.append(np.square(correlations @ reduction.T).sum(axis=1))
         left = np.maximum(1.0 - np.stack(explained, axis=1), 0.0)
@@ -202,27 +189,23 @@ class GaussianProcessPolicy:
             evaluations = LATER_EVALUATIONS if int(self.fits) > 0 else FIRST_EVALUATIONS
         whole("evaluations", evaluations, least=0)
         period = np.asarray(self.period)
-        rule = median_bandwidths(samples.observations, period=period, rng=rng)
+        rule = kernels.median_bandwidths(samples.observations, period=period, rng=rng)
         outputs = []
         for output in range(number):
             targets = samples.actions[:, output] - self.action_centre[output]
             own = OutputSamples(samples.observations, targets, samples.weights, period)
             found = self._searched(output, own, rule, evaluations, rng)
-            outputs.append(_found(found) | self._condition(own, found.hyperparameters, rng))
+            outputs.append(
+                vars(found.hyperparameters)
+                | {"objective": found.objective, "noise_at_bound": found.at_bound}
+                | self._condition(own, found.hyperparameters, rng)
+            )
         stacked = {name: np.stack([fitted[name] for fitted in outputs]) for name in outputs[0]}
         return replace(self, fits=np.asarray(int(self.fits) + 1), **stacked)
 
-    def fit_mean(
-        self,
-        observations: ArrayLike,
-        actions: ArrayLike,
-        sample_weights: ArrayLike,
-        *,
-        rng: np.random.Generator,
-        base_weights: ArrayLike | None = None,
-    ) -> Self:
+    def fit_mean(self, *samples: ArrayLike, rng: np.random.Generator, base_weights: ArrayLike | None = None) -> Self:
         """`fit` with the hyper-parameters held: noise and signal variance, bandwidths."""
-        kept = self.fit(observations, actions, sample_weights, rng=rng, base_weights=base_weights, evaluations=0)
+        kept = self.fit(*samples, rng=rng, base_weights=base_weights, evaluations=0)
         return replace(kept, objective=self.objective, noise_at_bound=self.noise_at_bound)
 
     def _searched(
@@ -256,13 +239,13 @@ class GaussianProcessPolicy:
     ) -> dict[str, Float[np.ndarray, "..."]]:
         """Inducing points and the posterior that goes with them, padded to M with points of no weight."""
         size = self.inducing_points.shape[1]
-        scale = inverse_bandwidths(parameters.bandwidths, samples.period)
-        points = coordinates(samples.observations, samples.period) * scale
+        scale = kernels.inverse_bandwidths(parameters.bandwidths, samples.period)
+        points = kernels.coordinates(samples.observations, samples.period) * scale
         rows = inducing_rows(points, samples.weights, size, rng=rng)
         centres = points[rows]
         regression = fit_sparse_regression(
-            squared_exponential(centres, points),
-            squared_exponential(centres, centres),
+            kernels.squared_exponential(centres, points),
+            kernels.squared_exponential(centres, centres),
             samples.targets,
             samples.weights,
             signal_variance=parameters.signal_variance,
@@ -274,15 +257,3 @@ class GaussianProcessPolicy:
             "mean_weights": np.pad(regression.mean_weights, (0, missing)),
             "reduction": np.pad(regression.reduction, ((0, missing), (0, missing))),
         }
-
-
-def _found(result: SearchResult) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """What a search found, under the policy's names."""
-    parameters = result.hyperparameters
-    return {
-        "bandwidths": parameters.bandwidths,
-        "signal_variance": np.asarray(parameters.signal_variance),
-        "noise_variance": np.asarray(parameters.noise_variance),
-        "objective": np.asarray(result.objective),
-        "noise_at_bound": np.asarray(result.at_bound),
-    }

@@ -142,17 +142,10 @@ class LinearGaussianPolicy:
         )
 
     def fit_mean(
-        self,
-        observations: ArrayLike,
-        actions: ArrayLike,
-        sample_weights: ArrayLike,
-        *,
-        rng: np.random.Generator | None = None,
-        base_weights: ArrayLike | None = None,
+        self, *samples: ArrayLike, rng: np.random.Generator | None = None, base_weights: ArrayLike | None = None
     ) -> Self:
         """`fit` with the noise held."""
-        fitted = self.fit(observations, actions, sample_weights, rng=rng, base_weights=base_weights)
-        return replace(fitted, factor=self.factor)
+        return replace(self.fit(*samples, rng=rng, base_weights=base_weights), factor=self.factor)
 
     def _means(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
         observations = np.asarray(observations, dtype=np.float64)

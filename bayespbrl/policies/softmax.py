@@ -16,16 +16,8 @@ from jaxtyping import Bool, Float, Int, Key
 from numpy.typing import ArrayLike
 from scipy.special import rel_entr
 
+from bayespbrl import kernels
 from bayespbrl.checks import indices, matrix, positive, whole
-from bayespbrl.kernels import (
-    as_periods,
-    coordinates,
-    inverse_bandwidths,
-    median_bandwidths,
-    radial_basis,
-    radial_basis_row,
-    squared_exponential,
-)
 from bayespbrl.policies.policy import AnyArray
 from bayespbrl.policies.samples import WeightedSamples, location_and_deviation, weighted_samples
 from bayespbrl.policies.spaces import dimension, number_of_values
@@ -98,7 +90,7 @@ class SoftmaxPolicy:
             scale=np.ones(states),
             centres=np.zeros((number_of_centres, states)),
             bandwidths=np.zeros(states),
-            period=as_periods(period, states),
+            period=kernels.as_periods(period, states),
             bandwidth_factor=np.asarray(positive("bandwidth_factor", bandwidth_factor)),
             prior_scale=np.asarray(positive("prior_scale", prior_scale)),
             fits=np.asarray(0),
@@ -108,7 +100,7 @@ class SoftmaxPolicy:
 
     def log_probabilities_at(self, observation: Float[AnyArray, " s"]) -> Float[Array, " a"]:
         """log π(·|s) at one observation, traceable."""
-        kernel = radial_basis_row(jnp.asarray(observation), self.centres, self.bandwidths, self.period)
+        kernel = kernels.radial_basis_row(jnp.asarray(observation), self.centres, self.bandwidths, self.period)
         linear = jnp.asarray(self.slopes) @ ((observation - self.location) / self.scale)
         return jax.nn.log_softmax(self.intercepts + linear + jnp.asarray(self.kernel_weights) @ kernel)
 
@@ -129,7 +121,7 @@ class SoftmaxPolicy:
         """π(·|sᵢ) for each of N observations."""
         observations = np.asarray(observations, dtype=np.float64)
         centres, period = np.asarray(self.centres), np.asarray(self.period)
-        kernel = radial_basis(observations, centres, np.asarray(self.bandwidths), period)
+        kernel = kernels.radial_basis(observations, centres, np.asarray(self.bandwidths), period)
         standardised = (observations - np.asarray(self.location)) / np.asarray(self.scale)
         logits = np.asarray(self.intercepts) + standardised @ np.asarray(self.slopes).T
         return np.exp(_log_softmax(logits + kernel @ np.asarray(self.kernel_weights).T))
@@ -163,12 +155,12 @@ class SoftmaxPolicy:
         visits, period = mass.sum(axis=1), np.asarray(self.period)
         location, deviation = location_and_deviation(states, visits / visits.sum())
         scale = np.where((deviation > 0) & ~np.isfinite(period), deviation, np.inf)
-        bandwidths = median_bandwidths(states, factor=float(self.bandwidth_factor), period=period, rng=rng)
-        points = coordinates(states, period) * inverse_bandwidths(bandwidths, period)
+        bandwidths = kernels.median_bandwidths(states, factor=float(self.bandwidth_factor), period=period, rng=rng)
+        points = kernels.coordinates(states, period) * kernels.inverse_bandwidths(bandwidths, period)
         rows = inducing_rows(points, visits, self.centres.shape[0], rng=rng)
         # features whose independent weights have the process's prior: K_NM L⁻ᵀ
-        back = inverse_factor(squared_exponential(points[rows], points[rows])).T
-        kernel = squared_exponential(points, points[rows]) @ back
+        back = inverse_factor(kernels.squared_exponential(points[rows], points[rows])).T
+        kernel = kernels.squared_exponential(points, points[rows]) @ back
         design = np.column_stack([np.ones(len(states)), (states - location) / scale, kernel])
         weights, newton_decrement, converged = _logistic_regression(design, mass, float(self.prior_scale))
         missing = self.centres.shape[0] - len(rows)
