@@ -19,12 +19,7 @@ from bayespbrl.diagnostics.comparison import compare_likelihoods, plot_compariso
 from bayespbrl.diagnostics.leave_one_out import influence, plot_influence
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.predictions import answer_probabilities
-from bayespbrl.diagnostics.prequential import (
-    calibration,
-    plot_calibration,
-    prequential_predictions,
-    score_predictions,
-)
+from bayespbrl.diagnostics.prequential import calibration, plot_calibration, prequential_predictions, score_predictions
 
 __all__ = [
     "answer_probabilities",

@@ -10,15 +10,7 @@ from scipy.optimize import isotonic_regression
 from scipy.special import xlog1py, xlogy
 
 from bayespbrl import checks
-from bayespbrl.diagnostics.predictions import (
-    DOMINATED,
-    PREFERRED,
-    answer_groups,
-    fitted_model,
-    held_out_probabilities,
-    number_of_preferences,
-    tied_rows,
-)
+from bayespbrl.diagnostics import predictions
 from bayespbrl.models import PreferenceModel
 
 
@@ -52,18 +44,18 @@ def prequential_predictions(
     differences = checks.matrix("differences", differences)
     number = len(differences)
     first_preferred = checks.flags("first_preferred", first_preferred, number)
-    groups = answer_groups(groups, number)
+    groups = predictions.answer_groups(groups, number)
     if indifferent is not None:
         indifferent = checks.flags("indifferent", indifferent, number)
     model = PreferenceModel() if model is None else model
     predicted = np.empty(number)
     for group in np.unique(groups):
         asked = groups == group
-        probabilities, _ = held_out_probabilities(
+        probabilities, _ = predictions.held_out_probabilities(
             differences, model, groups < group, asked, indifferent=indifferent, **sampling_options
         )
-        stated = probabilities[:, PREFERRED] + probabilities[:, DOMINATED]
-        column = np.where(first_preferred[asked], PREFERRED, DOMINATED)
+        stated = probabilities[:, predictions.PREFERRED] + probabilities[:, predictions.DOMINATED]
+        column = np.where(first_preferred[asked], predictions.PREFERRED, predictions.DOMINATED)
         predicted[asked] = np.take_along_axis(probabilities, column[:, None], axis=1)[:, 0] / stated
     return predicted
 
@@ -94,17 +86,17 @@ def calibration(
       what `score_predictions` returns; answers "no difference" are not scored.
     """
     differences = np.asarray(tree["constant_data"]["differences"])
-    number, tied = len(differences), tied_rows(tree)
+    number, tied = len(differences), predictions.tied_rows(tree)
     order = "drawn" if first_preferred is None else "given"
     if first_preferred is None:
         first_preferred = np.random.default_rng(seed).random(number) < 0.5
     first_preferred = checks.flags("first_preferred", first_preferred, number)
-    groups = answer_groups(groups, number)
+    groups = predictions.answer_groups(groups, number)
     if predicted is None:
-        options = {"seed": int(tree.attrs["seed"]), "number_of_preferences": number_of_preferences(tree)}
+        options = {"seed": int(tree.attrs["seed"]), "number_of_preferences": predictions.number_of_preferences(tree)}
         options |= sampling_options
         predicted = prequential_predictions(
-            differences, first_preferred, fitted_model(tree), groups=groups, indifferent=tied, **options
+            differences, first_preferred, predictions.fitted_model(tree), groups=groups, indifferent=tied, **options
         )
     predicted = np.asarray(predicted, dtype=np.float64)
     if predicted.shape != (number,):

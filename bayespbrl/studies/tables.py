@@ -1,6 +1,5 @@
 """The results of many trials as tables: the figures of each iteration, and the balancing time of the final policies."""
 
-import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,6 @@ from bayespbrl.runs.files import write_file, written_aside
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value")
 
-BALANCING_COLUMNS = ("survival", "balancing_steps", "balancing_seconds")
 BALANCING_FILE = "balancing.json"
 
 
@@ -112,29 +110,15 @@ def write_tables(table: xr.Dataset, directory: Path) -> None:
     Where a balancing time was measured there are three more columns: the share of evaluation episodes that survive, and
     the balancing time of the final policy in steps and in seconds, in the row of the last iteration.
     """
-    balancing = "balancing_steps" in table
-    last = table["iteration"].values[-1]
-    with (
-        written_aside(directory / "trials.csv") as aside,
-        aside.open("w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS + (BALANCING_COLUMNS if balancing else ()))
-        for number in table["seed"].values:
-            for iteration in table["iteration"].values:
-                cell = table.sel(seed=number, iteration=iteration)
-                answers, value = int(cell["answers"]), float(cell["value"])
-                row = [table.attrs["env"], table.attrs["utility"], number, iteration, answers, value]
-                if balancing:
-                    row += [
-                        f"{1 - float(cell['terminated']):g}",
-                        *(_balancing(cell) if iteration == last else ("", "")),
-                    ]
-                writer.writerow(row)
+    rows = table[["answers", "value"]].to_dataframe(["seed", "iteration"]).reset_index()
+    rows = rows.astype({"answers": int}).assign(env=table.attrs["env"], utility=table.attrs["utility"])[[*COLUMNS]]
+    if "balancing_steps" in table:
+        last = rows["iteration"] == rows["iteration"].max()
+        steps = rows["seed"].map(table["balancing_steps"].to_series())
+        rows["survival"] = [f"{share:g}" for share in (1 - table["terminated"]).values.ravel()]
+        rows["balancing_steps"] = steps.where(last)
+        rows["balancing_seconds"] = [round(number * bicycle.STEP_SECONDS, 6) for number in rows["balancing_steps"]]
+    with written_aside(directory / "trials.csv") as aside:
+        rows.to_csv(aside, index=False, lineterminator="\r\n")
     with written_aside(directory / "trials.nc") as aside:
         table.to_netcdf(aside, engine="h5netcdf")
-
-
-def _balancing(cell: xr.Dataset) -> tuple[float, float]:
-    steps = float(cell["balancing_steps"])
-    return steps, round(steps * bicycle.STEP_SECONDS, 6)
