@@ -10,7 +10,7 @@ from gymnasium.spaces import Box
 from bayespbrl.kernels import coordinates, inverse_bandwidths, radial_basis, squared_exponential
 from bayespbrl.policies import GaussianProcessPolicy, hyperparameter_search, sample_actions
 from bayespbrl.policies.hyperparameter_search import Hyperparameters, OutputSamples, search
-from bayespbrl.policies.sparse_regression import fit_sparse_regression, inducing_rows, precisions, whitened_correlations
+from bayespbrl.policies.sparse_regression import fit_sparse_regression, inducing_rows, inverse_factor, precisions
 
 STATES = Box(-np.inf, np.inf, (2,))
 TORQUE = Box(-20.0, 40.0, (1,))
@@ -116,7 +116,7 @@ def test_inducing_points_explain_more_than_random_ones():
 
     def unexplained(rows):
         centres = points[rows]
-        whitened = whitened_correlations(squared_exponential(centres, points), squared_exponential(centres, centres))
+        whitened = inverse_factor(squared_exponential(centres, centres)) @ squared_exponential(centres, points)
         return 1 - np.square(whitened).sum(axis=0)
 
     chosen = np.array([unexplained(inducing_rows(points, np.ones(1500), 60, rng=rng)) for _ in range(20)])

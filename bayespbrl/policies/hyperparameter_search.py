@@ -13,7 +13,7 @@ from cmaes import CMA
 from jaxtyping import Float, Int
 
 from bayespbrl.kernels import coordinates, inverse_bandwidths, squared_exponential
-from bayespbrl.policies.sparse_regression import inducing_rows, precisions, whitened_correlations
+from bayespbrl.policies.sparse_regression import inducing_rows, inverse_factor, precisions
 
 SUBSAMPLE, INDUCING_POINTS = 800, 50  # what the objective is computed with
 FAILED = 1e10  # the cost of hyper-parameters at which the linear algebra breaks down
@@ -149,9 +149,8 @@ def _cost(
         scale = inverse_bandwidths(parameters.bandwidths, period)
         centres = inducing * scale
         try:
-            whitened = whitened_correlations(
-                squared_exponential(centres, points * scale), squared_exponential(centres, centres)
-            )
+            inverse_lower = inverse_factor(squared_exponential(centres, centres))
+            whitened = inverse_lower @ squared_exponential(centres, points * scale)
             total = 0.0
             for train, test in folds:
                 mean, variance = _predict(whitened, targets, weights, train, test, parameters)

@@ -14,7 +14,7 @@ from gymnasium import Space
 from jax import Array
 from jaxtyping import Bool, Float, Int, Key
 from numpy.typing import ArrayLike
-from scipy.special import rel_entr
+from scipy.special import log_softmax, rel_entr
 
 from bayespbrl import kernels
 from bayespbrl.checks import indices, matrix, positive, whole
@@ -124,7 +124,7 @@ class SoftmaxPolicy:
         kernel = kernels.radial_basis(observations, centres, np.asarray(self.bandwidths), period)
         standardised = (observations - np.asarray(self.location)) / np.asarray(self.scale)
         logits = np.asarray(self.intercepts) + standardised @ np.asarray(self.slopes).T
-        return np.exp(_log_softmax(logits + kernel @ np.asarray(self.kernel_weights).T))
+        return np.exp(log_softmax(logits + kernel @ np.asarray(self.kernel_weights).T, axis=1))
 
     def kl_divergence(self, old: Self, observations: ArrayLike) -> Float[np.ndarray, " n"]:
         """KL(self ‖ old) at each of N observations."""
@@ -202,7 +202,7 @@ def _logistic_regression(
     visits = shares.sum(axis=1)
 
     def loss(weights: Float[np.ndarray, "a d"]) -> tuple[float, Float[np.ndarray, "n a"]]:
-        logarithms = _log_softmax(design @ weights.T)
+        logarithms = log_softmax(design @ weights.T, axis=1)
         penalty = 0.5 * precision * np.vdot(weights, weights)
         return penalty - np.vdot(shares, logarithms), np.exp(logarithms)  # eq. 14, and the prior
 
@@ -237,8 +237,3 @@ def _hessian(
             hessian[a, :, b, :] = (design * curvature[:, None]).T @ design
             hessian[b, :, a, :] = hessian[a, :, b, :].T
     return hessian.reshape(actions * size, actions * size)
-
-
-def _log_softmax(logits: Float[np.ndarray, "n a"]) -> Float[np.ndarray, "n a"]:
-    shifted = logits - logits.max(axis=1, keepdims=True)
-    return shifted - np.log(np.exp(shifted).sum(axis=1, keepdims=True))

@@ -34,13 +34,6 @@ class SparseRegression:
     reduction: Float[np.ndarray, "m m"]
 
 
-def whitened_correlations(
-    correlations: Float[np.ndarray, "m n"], inducing_correlations: Float[np.ndarray, "m m"]
-) -> Float[np.ndarray, "m n"]:
-    """V = L⁻¹R_MN from the correlations of inducing points with samples; columns of norm ≤ 1."""
-    return inverse_factor(inducing_correlations) @ correlations
-
-
 def precisions(
     whitened: Float[np.ndarray, "m n"],
     weights: Float[np.ndarray, " n"],
