@@ -130,6 +130,7 @@ def test_each_draw_is_of_its_own_component():
     np.testing.assert_allclose(shares, estimate.probabilities, atol=1.01 / 200)  # drawn evenly
 
 
+@pytest.mark.slow
 def test_features_without_bandwidths_are_averaged_over_the_steepness_alone():
     stays = [Trajectory(np.full(5, s), np.zeros(4, dtype=int), np.zeros(4)) for s in range(3)]
     estimate = averaged(OneHot(3), stays, [(1, 0), (2, 1)], likelihood="mixed")

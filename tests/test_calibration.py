@@ -60,6 +60,7 @@ def test_scores_of_two_predictions_by_hand():
     assert float(result["miscalibration"]) == pytest.approx(0.265)
 
 
+@pytest.mark.slow
 def test_expected_scores_and_their_spread_are_those_of_answers_drawn_from_the_predictions():
     predicted = np.array([0.05, 0.3, 0.6, 0.98])
     rng = np.random.default_rng(2)
@@ -135,7 +136,10 @@ def test_a_certain_prediction_scores_zero_if_right_and_minus_infinity_if_wrong()
 
 @pytest.mark.parametrize(
     ("likelihood", "p"),
-    [("mixed", lambda t: (2 * (t > 0) + expit(5 * t)) / 3), ("logistic", lambda t: expit(5 * t))],
+    [
+        ("mixed", lambda t: (2 * (t > 0) + expit(5 * t)) / 3),
+        pytest.param("logistic", lambda t: expit(5 * t), marks=pytest.mark.slow),
+    ],
     ids=["eq. 8", "logistic"],
 )
 def test_log_scores_of_the_answers_in_turn_sum_to_the_log_marginal_likelihood(likelihood, p):

@@ -19,7 +19,7 @@ from bayespbrl.cli.display import show_trials
 from bayespbrl.experts import simulated_expert
 from bayespbrl.studies import Trials
 
-SHORT = ["--utility", "linear-program", "--max-steps", "10"]
+SHORT = ["--utility", "linear-program", "--max-steps", "20"]
 QUICK = [*SHORT, "--iterations", "2"]
 
 
@@ -129,7 +129,7 @@ def test_resuming_a_finished_run_says_so(monkeypatch, capsys, finished):
 
 def test_resuming_draws_the_pictures_that_a_finished_run_lacks(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
-    options = {"utility": "linear-program", "iterations": 1, "max_steps": 10, "expert": "other"}
+    options = {"utility": "linear-program", "iterations": 1, "max_steps": 20, "expert": "other"}
     bayespbrl.start("gridworld", out, **options).run(simulated_expert())
     before = (out / "events.jsonl").read_bytes()
     assert call(monkeypatch, "resume", out) == 0

@@ -44,6 +44,7 @@ def test_leaving_out_one_at_a_time_agrees_with_quadrature_and_eq_8_keeps_the_ful
         np.testing.assert_allclose(got, left_out(ROWS, likelihood), atol=0.15, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_an_overconfident_likelihood_loses_and_the_best_comes_first(comparison):
     elpd = comparison["elpd"]
     assert comparison["candidate"].values[0] == "fitting"
@@ -52,6 +53,7 @@ def test_an_overconfident_likelihood_loses_and_the_best_comes_first(comparison):
     assert float(comparison["difference"][0]) == float(comparison["difference_error"][0]) == 0
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_a_sum_of_independent_terms(comparison):
     values = comparison["log_probability"].values
     np.testing.assert_allclose(comparison["elpd"], values.sum(axis=1))
@@ -111,6 +113,7 @@ def test_answers_of_no_difference_are_predicted_as_such():
     assert np.all(result["log_probability"].sel(candidate="wide")[tied] > np.log(0.3))
 
 
+@pytest.mark.slow
 def test_the_figure_names_each_candidate_on_the_axes_given(comparison):
     figure = Figure()
     left, right = figure.subplots(1, 2)

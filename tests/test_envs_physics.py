@@ -200,6 +200,7 @@ def test_bicycle_random_policy_falls_in_a_third_of_the_episodes():
 STEER_INTO_THE_FALL = np.array([[-900.0, -230.0, 19_000.0, 4450.0], [100.0, -23.0, -1000.0, -150.0]])
 
 
+@pytest.mark.slow
 def test_bicycle_linear_law_survives_fifty_steps():
     result = evaluate("bicycle", Linear(STEER_INTO_THE_FALL), episodes=10_000)
     assert result.total.mean() > -5
@@ -291,5 +292,6 @@ def test_acrobot_pumping_the_elbow_reaches_the_goal_and_its_return_is_minus_the_
     assert np.mean(result.terminated) > 0.7
 
 
+@pytest.mark.slow
 def test_acrobot_random_policy_never_reaches_the_goal():
     assert evaluate("acrobot", uniform(acrobot.DYNAMICS), episodes=100).total.mean() < -495

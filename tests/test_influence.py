@@ -65,6 +65,7 @@ def test_importance_weights_and_refits_agree_where_k_hat_is_low():
     np.testing.assert_allclose(result["change_estimated"], result["change"], atol=0.08)
 
 
+@pytest.mark.slow
 def test_refits_are_of_the_answers_with_the_largest_estimated_change(steep):
     assert np.any(influence(steep, refits=0)["pareto_k"] > 0.7)
     some = influence(steep, refits=3, **SAMPLING)

@@ -132,6 +132,7 @@ def test_duplicate_and_contradictory_answers_are_fine(likelihood):
     assert tree.attrs["converged"]
 
 
+@pytest.mark.slow
 def test_ties_pull_the_margin_to_zero():
     differences = np.array([[1.0, 0.0], [0.0, 1.0]])
     tree = sample_posterior(differences, tie_threshold=0.2, indifferent=np.array([False, True]), likelihood="logistic")

@@ -198,6 +198,7 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(g
     assert float(table["margin"][3]) == pytest.approx(margin, rel=1e-6)  # in the units of the utility
 
 
+@pytest.mark.slow
 def test_the_answers_have_the_probabilities_of_an_averaged_utility(swing_up_run):
     run, contents = bayespbrl.load(swing_up_run), read_contents(swing_up_run)
     table = report_tables.answers_table(contents)
@@ -265,6 +266,7 @@ def test_progress_is_the_utility_of_each_iterations_trajectories_by_the_last_est
     assert report_tables.progress_table(read_contents(gridworld_copy))["iteration"].values.tolist() == [1, 3]
 
 
+@pytest.mark.slow
 def test_the_summary_counts_the_comparisons_since_the_undominated_trajectory(tmp_path):
     asked = []
 
@@ -282,6 +284,7 @@ def test_the_summary_counts_the_comparisons_since_the_undominated_trajectory(tmp
     assert "3 comparisons since then found nothing better." in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("observations", "kind", "size"), [(1, "line", 60), (2, "plane", 3600), (4, "cloud", 11 * 30)])
 def test_states_of_any_dimension_are_shown(tmp_path, observations, kind, size):
     env = Drift(observations)
@@ -400,6 +403,7 @@ def test_of_several_updates_the_policys_kl_is_compared_with_the_bound_and_not_th
     assert "Where an iteration had several updates" in picture.caption
 
 
+@pytest.mark.slow
 def test_iterations_without_a_question_are_counted(page, tmp_path):
     run = start(tmp_path / "run", utility="linear-program", unasked_iterations=1, iterations=4).run(ReturnExpert())
     text = read(bayespbrl.load(tmp_path / "run").report()).text
@@ -454,6 +458,7 @@ def test_what_a_schedule_and_the_choice_of_hyperparameters_reported_is_shown(gri
 # Runs in progress, and damaged ones.
 
 
+@pytest.mark.slow
 def test_a_run_in_progress_has_a_report_at_every_stage(tmp_path):
     directory = tmp_path / "run"
     learner = start(directory, iterations=2)
@@ -480,6 +485,7 @@ def test_a_method_without_a_posterior_is_named(tmp_path, utility):
     assert "could not be made" not in text
 
 
+@pytest.mark.slow
 def test_a_run_whose_answers_were_all_ties_has_a_report(tmp_path):
     start(tmp_path / "run", iterations=1).run(lambda first, second: "tie")
     text = read(write_report(tmp_path / "run")).text
@@ -487,6 +493,7 @@ def test_a_run_whose_answers_were_all_ties_has_a_report(tmp_path):
     assert "2 of 2 answers were ties" in text
 
 
+@pytest.mark.slow
 def test_features_of_the_users_are_asked_for_and_used_when_passed(tmp_path):
     def own(states):
         return np.stack([states % 5, states // 5], axis=1).astype(float)
@@ -548,7 +555,7 @@ def test_a_feature_function_that_fails_costs_only_its_sections(tmp_path):
     assert "has 3 features, the run's 2" in other
 
 
-@pytest.mark.parametrize("iteration", [1, 2, 3])
+@pytest.mark.parametrize("iteration", [*(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2)), 3])
 def test_a_truncated_iteration_file_is_named_and_the_rest_is_reported(gridworld_copy, iteration):
     file = gridworld_copy / "iterations" / f"000{iteration}.nc"
     file.write_bytes(file.read_bytes()[:3000])
@@ -561,6 +568,7 @@ def test_a_truncated_iteration_file_is_named_and_the_rest_is_reported(gridworld_
     assert ("utility estimate that can be read is that of iteration 2" in text) == (iteration == 3)
 
 
+@pytest.mark.slow
 def test_a_log_that_is_cut_off_or_damaged_is_read_up_to_there(gridworld_copy):
     file = gridworld_copy / "events.jsonl"
     lines = file.read_bytes().splitlines(keepends=True)
@@ -574,7 +582,16 @@ def test_a_log_that_is_cut_off_or_damaged_is_read_up_to_there(gridworld_copy):
     assert "could not be made" not in read(write_report(gridworld_copy)).text
 
 
-@pytest.mark.parametrize("damage", ["missing log", "foreign log", "missing iterations", "broken summary"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "missing log",
+        *(
+            pytest.param(kind, marks=pytest.mark.slow)
+            for kind in ("foreign log", "missing iterations", "broken summary")
+        ),
+    ],
+)
 def test_whatever_is_missing_there_is_a_report(gridworld_copy, damage):
     if damage == "missing log":
         (gridworld_copy / "events.jsonl").unlink()
@@ -590,6 +607,7 @@ def test_whatever_is_missing_there_is_a_report(gridworld_copy, damage):
     assert "policy's value" in text
 
 
+@pytest.mark.slow
 def test_an_iteration_that_is_no_number_ends_what_is_read_of_the_log(gridworld_copy):
     lines = (gridworld_copy / "events.jsonl").read_text().splitlines()
     broken = [
@@ -603,6 +621,7 @@ def test_an_iteration_that_is_no_number_ends_what_is_read_of_the_log(gridworld_c
     assert "could not be made" not in read(write_report(gridworld_copy)).text
 
 
+@pytest.mark.slow
 def test_summaries_without_answers_still_make_a_report(gridworld_copy):
     (gridworld_copy / "events.jsonl").unlink()
     summary = json.loads((gridworld_copy / "summary.json").read_text())
@@ -648,6 +667,7 @@ def test_a_directory_that_is_no_run_is_refused_in_one_line(monkeypatch, capsys, 
 # The command line, and Markdown.
 
 
+@pytest.mark.slow
 def test_the_command_line_writes_the_report_and_says_where(monkeypatch, capsys, gridworld_copy, drawn):
     monkeypatch.setattr(sys, "argv", ["bayespbrl", "report", str(gridworld_copy), "--format", "md"])
     with pytest.raises(SystemExit) as stop:
@@ -674,6 +694,7 @@ def test_a_report_replaces_the_one_before(gridworld_copy):
     assert [path.name for path in gridworld_copy.glob("report*")] == ["report.html"]
 
 
+@pytest.mark.slow
 def test_importing_the_package_does_not_import_the_report():
     code = "import sys, bayespbrl; assert not any('report' in n or n == 'jinja2' for n in sys.modules if 'bayes' in n)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

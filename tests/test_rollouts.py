@@ -89,11 +89,17 @@ STEER = Gaussian(np.array([0.1]), np.array([3.0]))
 # Pure functions, compiled.
 
 
-def test_a_trajectory_is_the_loop_over_the_pure_functions():
-    trajectory = rollout("bicycle", WIDE, key=KEY, episodes=3)[1]
+@pytest.fixture(scope="module")
+def rides():
+    """Sixty episodes of the bicycle, of which some end in a fall."""
+    return rollout("bicycle", WIDE, key=KEY, episodes=60)
+
+
+def test_a_trajectory_is_the_loop_over_the_pure_functions(rides):
+    trajectory = rides[1]
     dynamics = rollouts.open_environment("bicycle").unwrapped.dynamics
     with jax.enable_x64(True):
-        start_key, steps_key = jax.random.split(jax.random.split(KEY, 3)[1])
+        start_key, steps_key = jax.random.split(jax.random.split(KEY, 60)[1])
         state, observation = functional.reset(dynamics, start_key)
         np.testing.assert_allclose(trajectory.states[0], observation, rtol=1e-12)
         for t, (action, reward) in enumerate(zip(trajectory.actions, trajectory.rewards, strict=True)):
@@ -106,8 +112,8 @@ def test_a_trajectory_is_the_loop_over_the_pure_functions():
 
 
 def test_shapes_and_dtypes_of_discrete_and_continuous_trajectories():
-    discrete = rollout("gridworld", UNIFORM_TABLE, key=KEY, episodes=2)
-    assert len(discrete) == 2
+    discrete = rollout("gridworld", UNIFORM_TABLE, key=KEY, episodes=3)
+    assert len(discrete) == 3
     assert discrete[0].states.shape == (301,)
     assert discrete[0].actions.shape == discrete[0].rewards.shape == (300,)
     assert discrete[0].states.dtype == discrete[0].actions.dtype == np.int64
@@ -119,11 +125,10 @@ def test_shapes_and_dtypes_of_discrete_and_continuous_trajectories():
     assert jnp.zeros(1).dtype == jnp.float32  # the caller's precision is as it was
 
 
-def test_a_trajectory_ends_with_its_last_real_state():
-    trajectories = rollout("bicycle", WIDE, key=KEY, episodes=60)
-    fallen = [trajectory for trajectory in trajectories if trajectory.terminated]
+def test_a_trajectory_ends_with_its_last_real_state(rides):
+    fallen = [trajectory for trajectory in rides if trajectory.terminated]
     assert 5 < len(fallen) < 55
-    for trajectory in trajectories:
+    for trajectory in rides:
         over = np.abs(trajectory.states[:, 2]) > np.pi / 15
         assert not over[:-1].any()
         assert over[-1] == trajectory.terminated
@@ -131,8 +136,8 @@ def test_a_trajectory_ends_with_its_last_real_state():
         assert (trajectory.rewards[-1] < -100) == trajectory.terminated
 
 
-def test_stored_actions_are_clipped_to_the_action_space():
-    actions = np.concatenate([t.actions for t in rollout("bicycle", WIDE, key=KEY, episodes=20)])
+def test_stored_actions_are_clipped_to_the_action_space(rides):
+    actions = np.concatenate([t.actions for t in rides])
     assert np.abs(actions).max(axis=0).tolist() == [2.0, 0.02]
 
 
@@ -141,6 +146,7 @@ def changes(trajectories):
     return [np.flatnonzero(np.diff(t.actions[:, 0]) != 0) + 1 for t in trajectories]
 
 
+@pytest.mark.slow
 def test_chance_is_held_for_so_many_steps_from_a_phase_of_each_episode_and_keeps_its_law():
     policy = Gaussian(np.zeros(1), np.array([5.0]))
     before = compilations()
@@ -170,14 +176,14 @@ def test_a_hold_that_is_no_number_of_steps_is_refused(hold):
         rollout("swing-up", STEER, key=KEY, episodes=1, hold=hold)
 
 
-def test_returns_are_those_of_the_same_rollout():
-    trajectories = rollout("bicycle", WIDE, key=KEY, episodes=40)
-    result = returns("bicycle", WIDE, key=KEY, episodes=40)
-    np.testing.assert_allclose(result.total, [t.total_reward for t in trajectories])
-    np.testing.assert_array_equal(result.steps, [len(t) for t in trajectories])
-    np.testing.assert_array_equal(result.terminated, [t.terminated for t in trajectories])
+def test_returns_are_those_of_the_same_rollout(rides):
+    result = returns("bicycle", WIDE, key=KEY, episodes=60)
+    np.testing.assert_allclose(result.total, [t.total_reward for t in rides])
+    np.testing.assert_array_equal(result.steps, [len(t) for t in rides])
+    np.testing.assert_array_equal(result.terminated, [t.terminated for t in rides])
 
 
+@pytest.mark.slow
 def test_uniform_gridworld_return_is_the_exact_expectation():
     total = returns("gridworld", UNIFORM_TABLE, key=KEY, episodes=4000).total
     assert total.mean() == pytest.approx(44.34, abs=4 * total.std() / np.sqrt(4000))
@@ -189,6 +195,7 @@ def test_the_key_decides_everything():
     assert np.any(first.states != other.states)
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_again_for_new_policies_keys_environments_or_evaluation_lengths():
     def once(seed):
         policy = Table(np.random.default_rng(seed).dirichlet(np.ones(5), size=25))
@@ -206,7 +213,7 @@ def test_nothing_is_compiled_again_for_new_policies_keys_environments_or_evaluat
 
 def test_an_explicit_limit_overrides_the_environments_own():
     assert len(rollout("gridworld", UNIFORM_TABLE, key=KEY, episodes=1, max_steps=7)[0]) == 7
-    assert returns("gridworld", UNIFORM_TABLE, key=KEY, episodes=2, max_steps=400).steps.tolist() == [400, 400]
+    assert returns("gridworld", UNIFORM_TABLE, key=KEY, episodes=3, max_steps=400).steps.tolist() == 3 * [400]
     pole = Gaussian(np.zeros(1), np.ones(1))
     assert len(rollout("Pendulum-v1", pole, key=KEY, episodes=2, max_steps=210)[1]) == 210  # its own: 200
 
@@ -247,7 +254,7 @@ def test_a_users_pure_functions_run_compiled():
 
 
 @pytest.mark.parametrize(("bad", "step"), [("observation", 3), ("reward", 4)])
-@pytest.mark.parametrize("run", [rollout, returns])
+@pytest.mark.parametrize("run", [rollout, pytest.param(returns, marks=pytest.mark.slow)])
 def test_pure_functions_that_return_nan_are_named_with_the_step(run, bad, step):
     with pytest.raises(ValueError, match=f"Drifting: .*NaN or infinity at step {step}"):
         run(Drifting({"bad": bad}), Coin(np.array(0.5)), key=KEY, episodes=2, max_steps=10)

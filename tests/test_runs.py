@@ -154,6 +154,7 @@ class Odd(gymnasium.Env):
         return self.np_random.uniform(-1, 1, (2, 2)), float(np.sum(action)), False, False, {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(2, start=1), gymnasium.spaces.Box(-1, 1, (1, 2))])
 def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):
     environment = Odd(space)
@@ -308,6 +309,7 @@ def test_of_two_learners_on_one_run_the_second_to_write_is_refused_and_nothing_i
     assert fingerprint(bayespbrl.load(tmp_path / "run").learner) == straight
 
 
+@pytest.mark.slow
 def test_undo_works_on_disk_across_iterations_and_the_same_answers_lead_to_the_same_run(copy, straight):
     for undone in (1, 2, 3, 4):
         learner = runs.resume(copy)
@@ -565,7 +567,7 @@ def rows(states):
     return np.eye(25)[states][:, ::2]
 
 
-@pytest.mark.parametrize("utility", ["linear-program", "known-reward"])
+@pytest.mark.parametrize("utility", ["linear-program", pytest.param("known-reward", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("answers", [0, 1, 2, 4])
 def test_a_run_with_features_of_the_users_own_wants_them_again(tmp_path, answers, utility):
     changes = {"features": rows, "utility": utility}
@@ -618,6 +620,7 @@ class Corridor(gymnasium.Env):
         return self.position, float(self.position), self.position in (0, 6), False, {}
 
 
+@pytest.mark.slow
 def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_come_back(tmp_path):
     options = {"utility": "linear-program", "iterations": 2, "max_steps": 12, "evaluation_episodes": 2}
     directory = tmp_path / "run"
@@ -672,7 +675,8 @@ def test_an_environment_as_its_name_makes_it_need_not_be_passed_again(tmp_path):
     assert fingerprint(bayespbrl.load(tmp_path / "run").learner) == fingerprint(learner)
 
 
-@pytest.mark.parametrize("policy", ["linear-gaussian", pytest.param("gaussian-process", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["linear-gaussian", "gaussian-process"])
 def test_a_run_with_continuous_actions_comes_back_and_goes_on_bit_for_bit(tmp_path, policy):
     options = {"utility": "linear-program", "iterations": 2, "evaluation_episodes": 2, "centres": 20, "max_steps": 15}
     whole = bayespbrl.start("swing-up", tmp_path / "whole", policy=policy, **options).run(ReturnExpert())

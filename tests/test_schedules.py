@@ -152,12 +152,15 @@ def test_bad_options_are_refused(largest):
         ConfidenceBound(largest)
 
 
+QUICK = {"utility": "linear-program", "max_steps": 20, "evaluation_episodes": 3}
+
+
 def three_lines(situation):
     return Bound(0.2 if situation.iteration == 1 else 0.4, "by the clock", None, {"answers": float(situation.answers)})
 
 
 def test_a_run_follows_a_schedule_of_the_users_own_records_why_and_goes_on_with_it(tmp_path):
-    learner = start("gridworld", tmp_path / "run", schedule=three_lines, iterations=3, evaluation_episodes=5)
+    learner = start("gridworld", tmp_path / "run", schedule=three_lines, iterations=3, **QUICK)
     expert = ReturnExpert()
     while len(learner.iterations) < 2:
         learner.tell([expert(*query.trajectories) for query in learner.ask()])

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayespbrl import load, runs
+from bayespbrl import ReturnExpert, load, runs, start
 from bayespbrl.rollouts import returns
 from bayespbrl.studies import Trials, run_trials
 from bayespbrl.studies import trials as trials_module
 from bayespbrl.studies.tables import COLUMNS, collect
 
-QUICK = {"utility": "linear-program", "iterations": 2, "max_steps": 20, "evaluation_episodes": 5}
+QUICK = {"utility": "linear-program", "iterations": 2, "max_steps": 20, "evaluation_episodes": 3}
 
 
 class ThisProcess:
@@ -50,8 +50,10 @@ def in_this_process(monkeypatch):
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
-    """Of two trials in processes of their own."""
-    return run_trials("gridworld", tmp_path_factory.mktemp("study"), seeds=range(5, 7), jobs=2, **QUICK)
+    """Of two trials, in this process."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        without_processes(monkeypatch)
+        return run_trials("gridworld", tmp_path_factory.mktemp("study"), seeds=range(5, 7), **QUICK)
 
 
 def test_every_trial_is_a_run_that_load_reads(study):
@@ -123,12 +125,17 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
     np.testing.assert_array_equal(table["spread"].sel(seed=2, iteration=3), [3, 20])
 
 
-def test_a_trial_in_a_process_of_its_own_is_the_run_of_its_seed(study, tmp_path):
-    from bayespbrl import ReturnExpert, start
-
+def test_a_trial_is_the_run_of_its_seed(study, tmp_path):
     learner = start("gridworld", tmp_path / "run", seed=5, **QUICK).run(ReturnExpert())
     kept = json.loads((study.path / "seed-5" / "summary.json").read_text())["iterations"]
     assert [entry["value"] for entry in learner.iterations] == pytest.approx([entry["value"] for entry in kept])
+
+
+@pytest.mark.slow
+def test_trials_in_processes_of_their_own_are_those_in_this_one(study, tmp_path):
+    apart = run_trials("gridworld", tmp_path / "study", seeds=range(5, 7), jobs=2, **QUICK)
+    assert load(apart.path / "seed-6").learner.finished
+    np.testing.assert_allclose(apart.table["value"], study.table["value"], rtol=1e-6)
 
 
 @pytest.mark.usefixtures("in_this_process")

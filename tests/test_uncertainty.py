@@ -180,6 +180,7 @@ CONTINUOUS = {
 }
 
 
+@pytest.mark.slow
 def test_q_of_any_weights_is_what_lstd_gives_for_their_utilities():
     learner = Learner("swing-up", **CONTINUOUS, seed=5).run(ReturnExpert())
     successors = successor_features(learner, seed=2)
