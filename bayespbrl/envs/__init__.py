@@ -26,19 +26,15 @@ SHORT_NAMES = {
     "acrobot": "bayespbrl/Acrobot-v0",
 }
 
-_REGISTERED: dict[str, tuple[str, Any]] = {
-    "bayespbrl/Gridworld-v0": ("bayespbrl.envs.gridworld:Gridworld", gridworld.DYNAMICS),
-    "bayespbrl/Bicycle-v0": ("bayespbrl.envs.bicycle:Bicycle", bicycle.DYNAMICS),
-    "bayespbrl/SwingUp-v0": ("bayespbrl.envs.swing_up:SwingUp", swing_up.DYNAMICS),
-    "bayespbrl/Acrobot-v0": ("bayespbrl.envs.acrobot:Acrobot", acrobot.DYNAMICS),
-}
+_MODULES: dict[str, Any] = {"Gridworld": gridworld, "Bicycle": bicycle, "SwingUp": swing_up, "Acrobot": acrobot}
 
 
 def register() -> None:
     """Register the environments with gymnasium; harmless when they are already there."""
-    for name, (entry_point, dynamics) in _REGISTERED.items():
-        if name not in gymnasium.registry:
-            gymnasium.register(id=name, entry_point=entry_point, max_episode_steps=dynamics.max_episode_steps)
+    for name, module in _MODULES.items():
+        if (identity := f"bayespbrl/{name}-v0") not in gymnasium.registry:
+            steps = module.DYNAMICS.max_episode_steps
+            gymnasium.register(id=identity, entry_point=f"{module.__name__}:{name}", max_episode_steps=steps)
 
 
 register()

@@ -104,13 +104,13 @@ class FunctionalEnv(gymnasium.Env):
 
 
 def picture(
-    draw: Callable[[Any], Any], *, inches: tuple[float, float] = (4.0, 4.0), dots_per_inch: int = 80
+    draw: Callable[[Any], Any], *, inches: tuple[float, float] = (4.0, 4.0)
 ) -> UInt8[np.ndarray, "height width 3"]:
     """What `draw(axes)` draws, without matplotlib's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=inches, dpi=dots_per_inch)
+    figure = Figure(figsize=inches, dpi=80)
     canvas = FigureCanvasAgg(figure)
     draw(figure.add_axes((0.12, 0.1, 0.83, 0.82)))  # a computed layout costs more than the drawing
     canvas.draw()

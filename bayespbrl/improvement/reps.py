@@ -221,11 +221,8 @@ def _temperature(kl: Callable[[float], float], kl_bound: float) -> float:
         return low
     while kl(high) > kl_bound:  # at most a few dozen times: KL falls as 1/η²
         high *= 10
-
-    def excess(logarithm: float) -> float:
-        return kl(float(np.exp(logarithm))) - kl_bound
-
-    return float(np.exp(brentq(excess, np.log(low), np.log(high), xtol=1e-12)))
+    logarithm = brentq(lambda value: kl(float(np.exp(value))) - kl_bound, np.log(low), np.log(high), xtol=1e-12)
+    return float(np.exp(logarithm))
 
 
 def advantages(

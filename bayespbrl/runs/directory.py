@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +69,7 @@ class RunDirectory:
         """The run directory at `path`; `ValueError` where that is no run, or one of another format."""
         path = Path(path)
         file = path / "settings.json"
-        try:
-            content = json.loads(file.read_text())
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{path}: expected a run directory with its settings.json, got {error}") from error
+        content = _read_json(file, f"{path}: expected a run directory with its settings.json")
         if not isinstance(content, dict) or not isinstance(content.get("format"), int):
             raise ValueError(f"{file}: expected the settings of a run, got a foreign file")
         if content["format"] > FORMAT:
@@ -230,20 +228,21 @@ def _event(number: int, line: bytes) -> Event | ValueError:
 def read_summary(directory: Path | str) -> dict[str, Any]:
     """`summary.json` of a run; `ValueError` if it is missing, truncated or foreign."""
     file = Path(directory) / "summary.json"
-    try:
-        summary = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{file}: expected the summary of a run, got {error}") from error
+    summary = _read_json(file, f"{file}: expected the summary of a run")
     if not isinstance(summary, dict) or not {"seed", "finished", "iterations"} <= set(summary):
         raise ValueError(f"{file}: expected the summary of a run, got a foreign file")
     return summary
 
 
+def _read_json(file: Path, expected: str) -> Any:
+    try:
+        return json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{expected}, got {error}") from error
+
+
 def fresh_directory(env: str) -> Path:
     """A path under `runs/` that does not exist yet, named after the environment and the time."""
     stem = f"{env.replace('/', '-').lower()}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
-    path, count = Path("runs") / stem, 1
-    while path.exists():
-        count += 1
-        path = Path("runs") / f"{stem}-{count}"
-    return path
+    names = (Path("runs") / (stem if number == 1 else f"{stem}-{number}") for number in count(1))
+    return next(path for path in names if not path.exists())

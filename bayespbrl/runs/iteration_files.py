@@ -111,20 +111,15 @@ AVERAGE = {
 
 def _estimate_groups(estimate: UtilityEstimate) -> dict[str, xr.DataTree]:
     """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
-    match estimate:
-        case LinearProgramUtility():
-            return {"utility": _weights_group(estimate, estimate.quality)}
-        case PosteriorUtility():
-            return {"utility": _weights_group(estimate, estimate.quality), **_posterior_groups(estimate.posterior)}
-        case AveragedUtility():
-            data = xr.Dataset({name: (dimensions, getattr(estimate, name)) for name, dimensions in AVERAGE.items()})
-            return {
-                "utility": _weights_group(estimate.sampled, estimate.quality),
-                "average": xr.DataTree(data, children=_function_group("base", estimate.base)),
-                **_posterior_groups(estimate.sampled.posterior),
-            }
-        case _:
-            return {"utility": to_tree(estimate)}
+    if isinstance(estimate, LinearProgramUtility):
+        return {"utility": _weights_group(estimate, estimate.quality)}
+    if (fit := estimate.sampled) is None:
+        return {"utility": to_tree(estimate)}
+    groups = {"utility": _weights_group(fit, estimate.quality)}
+    if isinstance(estimate, AveragedUtility):
+        data = xr.Dataset({name: (dimensions, getattr(estimate, name)) for name, dimensions in AVERAGE.items()})
+        groups["average"] = xr.DataTree(data, children=_function_group("base", estimate.base))
+    return groups | _posterior_groups(fit.posterior)
 
 
 def _weights_group(estimate: PosteriorUtility | LinearProgramUtility, quality: FitQuality) -> xr.DataTree:

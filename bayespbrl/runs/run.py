@@ -27,11 +27,6 @@ from bayespbrl.utility import UtilityEstimate
 def start(
     env: AnyEnvironment,
     directory: Path | str | None = None,
-    *,
-    features: StateFeatures | None = None,
-    policy: Policy | str | None = None,
-    schedule: Schedule | str | None = None,
-    query: QueryRule | str | None = None,
     **options: Any,
 ) -> Learner:
     """A new learner that keeps its events in a run directory.
@@ -39,17 +34,15 @@ def start(
     Args:
       env: as of `Learner`.
       directory: must not exist; a fresh one under `runs/` when None.
-      features, policy, schedule, query, **options: as of `Learner`. `expert="other"` is for an expert of your own: such
-        a run continues in Python only, not with `bayespbrl resume`.
+      **options: as of `Learner`. `expert="other"` is for an expert of your own: such a run continues in Python only,
+        not with `bayespbrl resume`.
 
     Raises:
       ValueError: bad options, or a directory that exists; nothing is left behind then.
     """
-    learner = Learner(env, features=features, policy=policy, schedule=schedule, query=query, **options)
-    log = RunDirectory.create(
-        fresh_directory(learner.settings.env) if directory is None else directory, learner.settings
-    )
-    return learner.logged(log)
+    learner = Learner(env, **options)
+    path = fresh_directory(learner.settings.env) if directory is None else directory
+    return learner.logged(RunDirectory.create(path, learner.settings))
 
 
 def resume(
