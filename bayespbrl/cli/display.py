@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from bayespbrl.envs.opening import environment_attribute, open_environment
 from bayespbrl.experts import TerminalExpert, simulated_expert
@@ -101,9 +101,8 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _table(title: str, columns: list[str], rows: list[list[str]]) -> None:
-    table = Table(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
+    headers = (Column(name, justify="right", no_wrap=True) for name in columns)
+    table = Table(*headers, title=title, title_justify="left")
     for row in rows:
         table.add_row(*row)
     console.print(table)
@@ -130,9 +129,8 @@ def _print_iterations(learner: Learner) -> None:
     ]
     share = [] if optimum is None else ["optimum"]
     columns = ["iteration"] * numbered + ["answers", "value", *share, "pairs", "KL/bound", "R̂", "draws"]
-    _table(
-        f"{learner.settings.env}, {learner.settings.estimation.utility}, seed {learner.settings.seed}", columns, rows
-    )
+    settings = learner.settings
+    _table(f"{settings.env}, {settings.estimation.utility}, seed {settings.seed}", columns, rows)
 
 
 def show_trials(study: Trials) -> None:
@@ -158,11 +156,10 @@ def show_trials(study: Trials) -> None:
 def _print_quartiles(quartiles: xr.Dataset, optimum: float | None, title: str) -> None:
     names = ("lower_quartile", "median", "upper_quartile")
     rows = []
-    for answers in quartiles["answers"].values:
-        at = quartiles.sel(answers=answers)
-        shares = [] if optimum is None else [f"{float(at[name]) / optimum:.3f}" for name in names]
-        rows.append([f"{answers:g}", *(f"{float(at[name]):.2f}" for name in names), *shares])
-    columns = ["answers", "25 %", "median", "75 %"] + ([] if optimum is None else ["25 %", "median", "75 %"])
+    for answers, *values in zip(quartiles["answers"].values, *(quartiles[name].values for name in names), strict=True):
+        shares = [] if optimum is None else [f"{value / optimum:.3f}" for value in values]
+        rows.append([f"{answers:g}", *(f"{value:.2f}" for value in values), *shares])
+    columns = ["answers", *["25 %", "median", "75 %"] * (1 if optimum is None else 2)]
     fraction = "" if optimum is None else ", and as a fraction of the optimum"
     _table(f"{title}: quartiles of the value{fraction}", columns, rows)
 

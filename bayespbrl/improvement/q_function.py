@@ -104,10 +104,7 @@ def _counted(steps: Transitions, utilities: np.ndarray) -> tuple[Transitions, np
     columns = utilities.reshape(len(utilities), -1).T
     sums = [np.bincount(inverse.ravel(), weights=column) for column in columns]
     means = (np.stack(sums) / counts).T.reshape(-1, *utilities.shape[1:])
-    unique = Transitions(
-        steps.states[first], steps.actions[first], steps.next_states[first], steps.rewards[first], steps.terminal[first]
-    )
-    return unique, means, counts.astype(float)
+    return Transitions(*(column[first] for column in vars(steps).values())), means, counts.astype(float)
 
 
 def _expected_features(policy: Any, states: np.ndarray, features: StateActionFeatures) -> np.ndarray:

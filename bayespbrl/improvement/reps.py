@@ -17,6 +17,7 @@ TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for l
 RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
 CONSTANT = "constant Q: nothing to gain"
+PerSample = Float[np.ndarray, " n"]  # one number a sample
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class RepsSolution:
       status: the solver's message.
     """
 
-    sample_weights: Float[np.ndarray, " n"]
-    probabilities: Float[np.ndarray, " n"]
+    sample_weights: PerSample
+    probabilities: PerSample
     value_weights: Float[np.ndarray, " d"]
     temperature: float
     kl: float
@@ -73,7 +74,7 @@ class WhitenedFeatures:
     mapping: Float[np.ndarray, "d r"]
 
 
-def whitened(state_features: Float[np.ndarray, "n d"], base_weights: Float[np.ndarray, " n"]) -> WhitenedFeatures:
+def whitened(state_features: Float[np.ndarray, "n d"], base_weights: PerSample) -> WhitenedFeatures:
     """Features whitened under W, without directions below `RANK_TOLERANCE` of the largest singular value.
 
     Raises:
@@ -199,11 +200,11 @@ def reps_weights_by_state(
 
 def _exponential(
     temperature: float,
-    logarithms: Float[np.ndarray, " n"],
-    q_values: Float[np.ndarray, " n"],
+    logarithms: PerSample,
+    q_values: PerSample,
     states: Int[np.ndarray, " n"],
     visits: Float[np.ndarray, " s"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " s"], float]:
+) -> tuple[PerSample, Float[np.ndarray, " s"], float]:
     """p(a|s) ∝ q(a|s) exp(Q(s, a)/η), V(s) and KL(p‖W), from log q(a|s), Q, the number of each state and W(s)."""
     logits = logarithms + q_values / temperature  # eq. 12
     highest = np.full(len(visits), -np.inf)
@@ -226,10 +227,8 @@ def _temperature(kl: Callable[[float], float], kl_bound: float) -> float:
 
 
 def advantages(
-    q_values: Float[np.ndarray, " n"],
-    constraint: WhitenedFeatures | Int[np.ndarray, " n"],
-    base_weights: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
+    q_values: PerSample, constraint: WhitenedFeatures | Int[np.ndarray, " n"], base_weights: PerSample
+) -> PerSample:
     """Aᵢ = Qᵢ − V(sᵢ) with V the regression of Q on the constraint's features under W.
 
     The limit of REPS at small bounds: p − W → √(2ε/E[A²])·W·A. Zero where only rounding is left of it.
@@ -251,7 +250,7 @@ def advantages(
 
 def _checked(
     q_values: ArrayLike, states: ArrayLike, base_weights: ArrayLike, kl_bound: float
-) -> tuple[Float[np.ndarray, " n"], Shaped[np.ndarray, "n ..."], Float[np.ndarray, " n"]]:
+) -> tuple[PerSample, Shaped[np.ndarray, "n ..."], PerSample]:
     q_values, states, base_weights = np.asarray(q_values), np.asarray(states), np.asarray(base_weights)
     size = len(q_values)
     if q_values.shape != (size,) or base_weights.shape != (size,) or states.shape[:1] != (size,):
@@ -268,10 +267,7 @@ def _checked(
 
 
 def _solve_dual(
-    q_values: Float[np.ndarray, " n"],
-    features: Float[np.ndarray, "n r"],
-    base_weights: Float[np.ndarray, " n"],
-    kl_bound: float,
+    q_values: PerSample, features: Float[np.ndarray, "n r"], base_weights: PerSample, kl_bound: float
 ) -> tuple[float, Float[np.ndarray, " r"], bool, str]:
     """Minimise g(η, v) = ηε + η log Σ Wᵢ exp((Qᵢ − vᵀφᵢ)/η) (eq. 13 with φ̂ = 0) over η ≥ floor and v."""
     rank = features.shape[1]

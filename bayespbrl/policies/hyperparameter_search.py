@@ -17,6 +17,8 @@ from bayespbrl.policies.sparse_regression import inducing_rows, inverse_factor, 
 
 SUBSAMPLE, INDUCING_POINTS = 800, 50  # what the objective is computed with
 FAILED = 1e10  # the cost of hyper-parameters at which the linear algebra breaks down
+PerSample = Float[np.ndarray, " n"]  # one number a sample
+Logarithms = Float[np.ndarray, " p"]  # of the hyper-parameters searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +33,8 @@ class OutputSamples:
     """
 
     observations: Float[np.ndarray, "n s"]
-    targets: Float[np.ndarray, " n"]
-    weights: Float[np.ndarray, " n"]
+    targets: PerSample
+    weights: PerSample
     period: Float[np.ndarray, " s"]
 
     def rows(self, chosen: Int[np.ndarray, " m"]) -> "OutputSamples":
@@ -49,12 +51,12 @@ class Hyperparameters:
     noise_variance: float
 
     @property
-    def logarithms(self) -> Float[np.ndarray, " p"]:
+    def logarithms(self) -> Logarithms:
         """log b of the dimensions that are used (b > 0), then log s², log σ²."""
         used = self.bandwidths[self.bandwidths > 0]
         return np.log(np.concatenate([used, [self.signal_variance, self.noise_variance]]))
 
-    def replaced(self, logarithms: Float[np.ndarray, " p"]) -> "Hyperparameters":
+    def replaced(self, logarithms: Logarithms) -> "Hyperparameters":
         """The same dimensions with other values, given as `logarithms`."""
         values = np.exp(logarithms)
         bandwidths = np.zeros_like(self.bandwidths)
@@ -120,9 +122,7 @@ def search(
     return SearchResult(reference.replaced(best), -best_cost, at_bound)
 
 
-def _bounds(
-    centre: Float[np.ndarray, " p"], minimum_noise_variance: float
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+def _bounds(centre: Logarithms, minimum_noise_variance: float) -> tuple[Logarithms, Logarithms]:
     """Lower and upper bounds of the logarithms, about those of b̄, ȳ² and ȳ²."""
     reach = np.full(len(centre), np.log(20.0))
     low, high = centre - reach, centre + reach
@@ -131,9 +131,7 @@ def _bounds(
     return low, high
 
 
-def _cost(
-    samples: OutputSamples, start: Hyperparameters, rng: np.random.Generator
-) -> Callable[[Float[np.ndarray, " p"]], float]:
+def _cost(samples: OutputSamples, start: Hyperparameters, rng: np.random.Generator) -> Callable[[Logarithms], float]:
     """The function of the logarithms that CMA-ES minimises; folds and inducing points are fixed before it starts."""
     points, period = coordinates(samples.observations, samples.period), samples.period
     scale = inverse_bandwidths(start.bandwidths, period)
@@ -144,7 +142,7 @@ def _cost(
     if not middle:
         folds = [(slice(None), slice(None))]  # one sample cannot be halved
 
-    def cost(logarithms: Float[np.ndarray, " p"]) -> float:
+    def cost(logarithms: Logarithms) -> float:
         parameters = start.replaced(logarithms)
         scale = inverse_bandwidths(parameters.bandwidths, period)
         centres = inducing * scale
@@ -165,8 +163,8 @@ def _cost(
 
 def _predict(
     whitened: Float[np.ndarray, "m n"],
-    targets: Float[np.ndarray, " n"],
-    weights: Float[np.ndarray, " n"],
+    targets: PerSample,
+    weights: PerSample,
     train: slice,
     test: slice,
     parameters: Hyperparameters,

@@ -19,6 +19,7 @@ from bayespbrl.kernels import squared_exponential
 
 JITTER = 1e-8  # relative to the signal variance; the kernel's rounding errors are near 1e-14
 CANDIDATES = 2000  # rows among which the inducing points are chosen
+PerSample = Float[np.ndarray, " n"]  # one number a sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +36,8 @@ class SparseRegression:
 
 
 def precisions(
-    whitened: Float[np.ndarray, "m n"],
-    weights: Float[np.ndarray, " n"],
-    *,
-    signal_variance: float,
-    noise_variance: float,
-) -> Float[np.ndarray, " n"]:
+    whitened: Float[np.ndarray, "m n"], weights: PerSample, *, signal_variance: float, noise_variance: float
+) -> PerSample:
     """Λ⁻¹ (Snelson and Ghahramani 2006) with the noise σ²/w (Kober et al. 2010), as w/(w s²(1 − |v|²) + σ²)."""
     unexplained = np.maximum(1.0 - np.einsum("mn,mn->n", whitened, whitened), 0.0)
     return weights / (weights * (signal_variance * unexplained) + noise_variance)
@@ -49,8 +46,8 @@ def precisions(
 def fit_sparse_regression(
     correlations: Float[np.ndarray, "m n"],
     inducing_correlations: Float[np.ndarray, "m m"],
-    targets: Float[np.ndarray, " n"],
-    weights: Float[np.ndarray, " n"],
+    targets: PerSample,
+    weights: PerSample,
     *,
     signal_variance: float,
     noise_variance: float,
@@ -80,7 +77,7 @@ def fit_sparse_regression(
 
 
 def inducing_rows(
-    points: Float[np.ndarray, "n e"], weights: Float[np.ndarray, " n"], number: int, *, rng: np.random.Generator
+    points: Float[np.ndarray, "n e"], weights: PerSample, number: int, *, rng: np.random.Generator
 ) -> Int[np.ndarray, " m"]:
     """Rows of `points` to induce from: where the weight lies, and no two where one would do.
 
