@@ -107,12 +107,10 @@ def returns(
     if dynamics is None:
         run = _by_interface(env, policy, key, episodes, limit, max_steps is not None)
         rows = [(trajectory.total_reward, len(trajectory), trajectory.terminated) for trajectory in run]
-        total, steps, terminated = (np.array(column) for column in zip(*rows, strict=True))
-        return Returns(total, steps, terminated)
+        return Returns(*(np.array(column) for column in zip(*rows, strict=True)))
     with jax.enable_x64(True):
-        total, steps, terminated, finite = (
-            np.asarray(part) for part in _evaluate(dynamics, policy, key, limit, episodes=episodes)
-        )
+        evaluated = _evaluate(dynamics, policy, key, limit, episodes=episodes)
+        total, steps, terminated, finite = map(np.asarray, evaluated)
     if not finite.all():
         raise ValueError(_not_finite(env, int(steps[~finite].min())))
     return Returns(total, steps, terminated)

@@ -52,13 +52,11 @@ def _end_with_parent() -> None:
 @contextmanager
 def _environment(variables: dict[str, str]) -> Iterator[None]:
     """Environment variables that child processes inherit, restored afterwards."""
-    before = {name: os.environ.get(name) for name in variables}
+    before = {name: os.environ[name] for name in variables if name in os.environ}
     os.environ.update(variables)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in variables:
+            os.environ.pop(name, None)
+        os.environ.update(before)

@@ -30,17 +30,12 @@ def collect(directories: Sequence[Path | str]) -> xr.Dataset:
     seeds = [summary["seed"] for summary in summaries]
     iterations = [entry["iteration"] for entry in summaries[0]["iterations"]]
     rows = [[_flat(entry) for entry in summary["iterations"]] for summary in summaries]
-    skipped = {"iteration"} | {
-        name
-        for summary in summaries
-        for entry in summary["iterations"]
-        for name in entry
-        if isinstance(entry[name], dict)
-    }
+    entries = [entry for summary in summaries for entry in summary["iterations"]]
+    nested = {name for entry in entries for name, value in entry.items() if isinstance(value, dict)}
     variables: dict[str, Any] = {}
     for name in dict.fromkeys(name for row in rows for entry in row for name in entry):
         values = [[entry.get(name) for entry in row] for row in rows]
-        if name not in skipped and (figures := _figures(values)) is not None:
+        if name not in {"iteration", *nested} and (figures := _figures(values)) is not None:
             variables[name] = (("seed", "iteration", f"{name}_dimension")[: figures.ndim], figures)
     if all(has_balancing(path) for path in directories):
         lasted = [json.loads((Path(path) / BALANCING_FILE).read_text()) for path in directories]
