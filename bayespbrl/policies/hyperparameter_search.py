@@ -137,7 +137,7 @@ def _cost(samples: OutputSamples, start: Hyperparameters, rng: np.random.Generat
     scale = inverse_bandwidths(start.bandwidths, period)
     inducing = points[inducing_rows(points * scale, samples.weights, INDUCING_POINTS, rng=rng)]
     order, middle = rng.permutation(len(points)), len(points) // 2
-    points, targets, weights = points[order], samples.targets[order], samples.weights[order]  # so that a fold is a view
+    points, samples = points[order], samples.rows(order)  # so that a fold is a view
     folds = [(slice(middle), slice(middle, None)), (slice(middle, None), slice(middle))]
     if not middle:
         folds = [(slice(None), slice(None))]  # one sample cannot be halved
@@ -151,30 +151,25 @@ def _cost(samples: OutputSamples, start: Hyperparameters, rng: np.random.Generat
             whitened = inverse_lower @ squared_exponential(centres, points * scale)
             total = 0.0
             for train, test in folds:
-                mean, variance = _predict(whitened, targets, weights, train, test, parameters)
-                errors = np.square(targets[test] - mean)
-                total += float(weights[test] @ (0.5 * (errors / variance + np.log(2 * np.pi * variance))))
+                mean, variance = _predict(whitened, samples, train, test, parameters)
+                errors = np.square(samples.targets[test] - mean)
+                total += float(samples.weights[test] @ (0.5 * (errors / variance + np.log(2 * np.pi * variance))))
         except np.linalg.LinAlgError:
             return FAILED
-        return float(total / weights.sum()) if np.isfinite(total) else FAILED
+        return float(total / samples.weights.sum()) if np.isfinite(total) else FAILED
 
     return cost
 
 
 def _predict(
-    whitened: Float[np.ndarray, "m n"],
-    targets: PerSample,
-    weights: PerSample,
-    train: slice,
-    test: slice,
-    parameters: Hyperparameters,
+    whitened: Float[np.ndarray, "m n"], samples: OutputSamples, train: slice, test: slice, parameters: Hyperparameters
 ) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
     """Predictive mean and variance of the samples `test` from the samples `train` (Snelson and Ghahramani 2006)."""
     signal, noise = parameters.signal_variance, parameters.noise_variance
     seen, new = whitened[:, train], whitened[:, test]
-    scaled = seen * precisions(seen, weights[train], signal_variance=signal, noise_variance=noise)
+    scaled = seen * precisions(seen, samples.weights[train], signal_variance=signal, noise_variance=noise)
     inverse_lower = np.linalg.inv(np.linalg.cholesky(np.eye(len(seen)) + signal * (scaled @ seen.T)))
     left = inverse_lower @ new
-    mean = signal * (left.T @ (inverse_lower @ (scaled @ targets[train])))
+    mean = signal * (left.T @ (inverse_lower @ (scaled @ samples.targets[train])))
     unexplained = np.maximum(1.0 - np.einsum("mn,mn->n", new, new), 0.0)
     return mean, signal * (unexplained + np.einsum("mn,mn->n", left, left)) + noise
