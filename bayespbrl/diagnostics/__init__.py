@@ -11,6 +11,7 @@ Each result is an xarray `Dataset`. Each plot function draws on the matplotlib a
   uncertainty     posterior draws of returns, rankings, Q and greedy actions
   estimates       what all of these ask of a utility estimate
   plots           figures of a run and of a study
+  axes            what figures share: labels, legends, numbered cells
   report          the diagnostic report of a run, as one HTML or Markdown file
 """
 

@@ -4,9 +4,9 @@ import numpy as np
 import xarray as xr
 from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from bayespbrl import checks
+from bayespbrl.diagnostics.axes import finished
 from bayespbrl.models.convergence import chain_convergence
 
 
@@ -61,15 +61,8 @@ def plot_convergence(result: xr.Dataset, axes: Axes) -> Axes:
         place = (k, float(result["effective_sample_size"][k]))
         axes.annotate(f"R̂ {float(result['rhat'][k]):.2f}", place, xytext=(3, 3), textcoords="offset points", fontsize=7)
     verdict = "converged" if result.attrs["converged"] else "not converged"
-    axes.set(
-        xlabel="preference",
-        ylabel="effective sample size",
-        ylim=(0, None),
-        title=f"{verdict}, largest R̂ {result.attrs['rhat_max']:.3f}",
-    )
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend()
-    return axes
+    title = f"{verdict}, largest R̂ {result.attrs['rhat_max']:.3f}"
+    return finished(axes, xlabel="preference", ylabel="effective sample size", ylim=(0, None), title=title)
 
 
 def plot_ranks(tree: xr.DataTree, axes: Axes, *, preference: int | None = None, bins: int = 20) -> Axes:

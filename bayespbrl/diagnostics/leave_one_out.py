@@ -8,9 +8,9 @@ import numpy as np
 import xarray as xr
 from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from bayespbrl import checks
+from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_probabilities, refit, tied_rows
 
 PARETO_K_LIMIT = 0.7
@@ -71,10 +71,8 @@ def plot_influence(result: xr.Dataset, axes: Axes) -> Axes:
     for k in numbers[result["pareto_k"].values > PARETO_K_LIMIT]:
         text = f"k̂ {float(result['pareto_k'][k]):.1f}"
         axes.annotate(text, (k, highest[k]), xytext=(3, 3), textcoords="offset points", fontsize=7)
-    axes.set(xlabel="answer left out", ylabel="change of the mean weights / σ", ylim=(0, None), title="Influence")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend()
-    return axes
+    axes.set(ylim=(0, None), title="Influence")
+    return finished(axes, xlabel="answer left out", ylabel="change of the mean weights / σ")
 
 
 def _estimates(tree: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:

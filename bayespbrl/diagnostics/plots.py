@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bayespbrl.diagnostics.axes import number_cells
 from bayespbrl.diagnostics.estimates import expect_estimate
 from bayespbrl.envs.opening import environment_attribute
 from bayespbrl.learner import Learner
@@ -103,8 +104,7 @@ def _map_of_cells(steps: Transitions, values: np.ndarray, axes: Axes, *, shape: 
     means = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan).reshape(shape)
     image = axes.imshow(means, cmap="viridis")
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
-    axes.set_xticks(range(shape[1]), [str(j + 1) for j in range(shape[1])])
-    axes.set_yticks(range(shape[0]), [str(i + 1) for i in range(shape[0])])
+    number_cells(axes, shape)
 
 
 def _points(steps: Transitions, values: np.ndarray, axes: Axes) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import xarray as xr
 from arviz_stats import psense
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from bayespbrl import checks
+from bayespbrl.diagnostics.axes import finished
 from bayespbrl.models.low_rank import low_rank
 
 COMPONENTS = ("prior", "likelihood")
@@ -70,10 +70,7 @@ def plot_sensitivity(result: xr.Dataset, axes: Axes) -> Axes:
     for component, offset in zip(COMPONENTS, (-0.2, 0.2), strict=True):
         axes.bar(numbers + offset, result["sensitivity"].sel(component=component), 0.4, label=labels[component])
     axes.axhline(result.attrs["threshold"], color="0.5", linestyle="--", linewidth=1)
-    axes.set(xlabel="quantity", ylabel="power-scaling sensitivity", title="Sensitivity")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend()
-    return axes
+    return finished(axes, xlabel="quantity", ylabel="power-scaling sensitivity", title="Sensitivity")
 
 
 def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import rankdata
 
 from bayespbrl import checks
+from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.estimates import expect_sampled, is_average
 from bayespbrl.improvement.q_function import QFunction, estimate_q
 from bayespbrl.learner import Learner
@@ -157,10 +158,7 @@ def q_draws(
     labels = actions.reshape(len(actions), -1)
     return xr.Dataset(
         {"q": (("chain", "draw", "state", "action"), draws.reshape(*draws.shape[:2], len(states), len(actions)))},
-        {
-            "state": np.arange(len(states)),
-            "action": labels[:, 0] if labels.shape[1] == 1 else np.arange(len(actions)),
-        },
+        {"state": np.arange(len(states)), "action": labels[:, 0] if labels.shape[1] == 1 else np.arange(len(actions))},
         _convergence(fit),
     )
 
@@ -201,12 +199,8 @@ def plot_returns(returns: xr.Dataset, axes: Axes) -> Axes:
     _intervals(values[:, order], np.arange(len(order)), axes, horizontal=True)
     axes.set_yticks(np.arange(len(order)), [str(label) for label in returns["trajectory"].values[order]])
     axes.axvline(0.0, color="0.5", linestyle="--", linewidth=1)
-    axes.set(
-        xlabel="return relative to the mean (units of the utility)",
-        ylabel="trajectory",
-        title=_titled("Returns", returns),
-    )
-    return axes
+    axes.set_title(_titled("Returns", returns))
+    return finished(axes, whole=False, xlabel="return relative to the mean (units of the utility)", ylabel="trajectory")
 
 
 def plot_ranking(ranking: xr.Dataset, axes: Axes) -> Axes:
@@ -221,9 +215,8 @@ def plot_ranking(ranking: xr.Dataset, axes: Axes) -> Axes:
     axes.set_yticks(
         np.arange(number), [f"{label} ({share:.0%})" for label, share in zip(labels, best, strict=True)], fontsize=8
     )
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="rank", ylabel="trajectory (probability to be best)", title=_titled("Ranking", ranking))
-    return axes
+    title = _titled("Ranking", ranking)
+    return finished(axes, xlabel="rank", ylabel="trajectory (probability to be best)", title=title)
 
 
 def plot_q(q: xr.Dataset, axes: Axes, *, state: int = 0) -> Axes:
@@ -261,8 +254,7 @@ def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
     places = np.unique(np.linspace(0, len(actions) - 1, min(len(actions), 9)).round().astype(int))
     axes.set_xticks(places, [f"{actions[place]:g}" for place in places])
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="action", ylabel="state", title=_titled("Best action", greedy))
-    return axes
+    return finished(axes, whole=False, xlabel="action", ylabel="state", title=_titled("Best action", greedy))
 
 
 def thinned(estimate: PosteriorUtility, number: int) -> PosteriorUtility:

@@ -29,7 +29,7 @@ def answers(contents: RunContents, table: xr.Dataset) -> Body:
         )
         alt = f"Probabilities of {len(contents.answers)} answers before and after they were given."
         panels = [("", partial(figures.plot_answers, table))]
-        blocks.append(drawn("answers", panels, caption, alt, columns=1, size=(7.6, 3.2)))
+        blocks.append(drawn("answers", panels, caption, alt, size=(7.6, 3.2)))
     order = surprise_order(table)
     text = []
     if contents.environment is None:

@@ -3,7 +3,7 @@
 A file that cannot be read costs only its own contents.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -107,99 +107,88 @@ def read_contents(
     """
     run = RunDirectory.open(directory)
     log = read_log(run.path, run.settings)
-    damage, answers = list(log.damage), list(log.answers)
-    environment = _environment(run.settings, env, damage)
-    reader = _IterationReader(run, features, damage)
-    for number in range(1, max(log.collected, len(log.summaries)) + 1):
-        answers = reader.read(number, answers, improved=number <= len(log.summaries))
-    return RunContents(
+    contents = RunContents(
         path=run.path,
         settings=run.settings,
         iterations=log.summaries,
-        answers=tuple(answers),
+        answers=log.answers,
         preferences=log.state.preferences,
-        trajectories=reader.trajectories,
-        estimate=reader.estimate,
-        estimate_iteration=reader.estimate_iteration,
-        features_missing=reader.features_missing,
-        environment=environment,
         open_question=None if log.state.query is None else log.state.query.number,
-        damage=tuple(damage),
+        damage=log.damage,
     )
+    contents = _with_environment(contents, env)
+    if features is None and run.settings.features.features == "other":
+        features, contents = _not_passed, replace(contents, features_missing="it was not passed again")
+    collected = len(log.state.trajectories) // run.settings.rollouts.trajectories_per_iteration
+    for number in range(1, max(collected, len(log.summaries)) + 1):
+        contents = _with_iteration(contents, number, run.iteration_file(number), features)
+    return contents
 
 
 def _not_passed(states: np.ndarray) -> np.ndarray:
     raise ValueError("features: expected those that the run was started with, got none")
 
 
-class _IterationReader:
-    """Reads the iteration files in turn, and predicts the answers of each by the estimate of the one before."""
-
-    def __init__(self, run: RunDirectory, features: StateFeatures | None, damage: list[ReportWarning]) -> None:
-        self.run, self.damage, self.features, self.features_missing = run, damage, features, ""
-        if features is None and run.settings.features.features == "other":
-            self.features, self.features_missing = _not_passed, "it was not passed again"
-        self.trajectories: dict[int, Trajectory] = {}
-        self.estimate: UtilityEstimate | None = None
-        self.estimate_iteration = 0
-
-    def read(self, iteration: int, answers: Sequence[AnsweredQuestion], *, improved: bool) -> list[AnsweredQuestion]:
-        """`answers` with the predictions of those of this iteration."""
-        parts = self._parts(iteration, ("trajectories", "estimate") if improved else ("trajectories",))
-        if not parts:
-            return list(answers)
-        first = (iteration - 1) * self.run.settings.rollouts.trajectories_per_iteration
-        self.trajectories |= dict(enumerate(parts["trajectories"], start=first))
-        if self.estimate_iteration == iteration - 1:
-            answers = [self._predicted(answer) if answer.iteration == iteration else answer for answer in answers]
-        if "estimate" in parts:
-            self.estimate, self.estimate_iteration = parts["estimate"], iteration
-            self.features_missing = self.features_missing or self._features_failure(parts["trajectories"][0])
-        return list(answers)
-
-    def _parts(self, iteration: int, names: tuple[str, ...]) -> dict[str, Any]:
-        file = self.run.iteration_file(iteration)
-        try:
-            return read_parts(file, names, features=self.features)
-        except ValueError as error:
-            remedy = "Restore this file from a copy: its contents are missing here, and the run cannot continue."
-            self.damage.append(ReportWarning(f"Missing data: iterations/{error}.", remedy))
+def _with_iteration(contents: RunContents, iteration: int, file: Path, features: StateFeatures | None) -> RunContents:
+    """`contents` with what an iteration's file holds, and its answers predicted by the estimate of the one before."""
+    parts: dict[str, Any] = {}
+    try:
+        names = ("trajectories", "estimate") if iteration <= len(contents.iterations) else ("trajectories",)
+        parts = read_parts(file, names, features=features)
+    except ValueError as error:
+        remedy = "Restore this file from a copy: its contents are missing here, and the run cannot continue."
+        contents = _damaged(contents, f"Missing data: iterations/{error}.", remedy)
         with suppress(ValueError):  # only the estimate may be unreadable
-            return read_parts(file, ("trajectories",))
-        return {}
-
-    def _features_failure(self, trajectory: Trajectory) -> str:
-        """What is wrong with features that were passed; empty if nothing."""
-        if self.features is None or not of_states(self.estimate):
-            return ""
-        try:
-            width = checked_features(self.features, trajectory.states).shape[1]
-        except Exception as error:  # a function of the user's may raise anything
-            return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
-        expected = len(one_setting(self.estimate).weights)
-        return "" if width == expected else f"the one that was passed has {width} features, the run's {expected}"
-
-    def _predicted(self, answer: AnsweredQuestion) -> AnsweredQuestion:
-        numbers = (answer.first, answer.second)
-        both = [self.trajectories[number] for number in numbers if number in self.trajectories]
-        if self.run.settings.estimation.utility in WITHOUT_POSTERIOR or len(both) < 2:
-            return answer
-        if self.estimate is None:
-            return replace(answer, predicted=0.5)  # without any answer, either is equally probable
-        if sampled(self.estimate) is None or self.features_missing:
-            return answer
-        return replace(answer, predicted=first_preferred_probability(self.estimate, *both))
+            parts = read_parts(file, ("trajectories",))
+    if not parts:
+        return contents
+    first = (iteration - 1) * contents.settings.rollouts.trajectories_per_iteration
+    trajectories = {**contents.trajectories, **dict(enumerate(parts["trajectories"], start=first))}
+    contents = replace(contents, trajectories=trajectories)
+    if contents.estimate_iteration == iteration - 1:
+        answers = (_predicted(contents, a) if a.iteration == iteration else a for a in contents.answers)
+        contents = replace(contents, answers=tuple(answers))
+    if "estimate" in parts:
+        contents = replace(contents, estimate=parts["estimate"], estimate_iteration=iteration)
+        missing = contents.features_missing or _features_failure(contents, features, parts["trajectories"][0])
+        contents = replace(contents, features_missing=missing)
+    return contents
 
 
-def _environment(
-    settings: Settings, env: gymnasium.Env | FuncEnv | None, damage: list[ReportWarning]
-) -> gymnasium.Env | None:
+def _features_failure(contents: RunContents, features: StateFeatures | None, trajectory: Trajectory) -> str:
+    """What is wrong with features that were passed; empty if nothing."""
+    if features is None or not of_states(contents.estimate):
+        return ""
+    try:
+        width = checked_features(features, trajectory.states).shape[1]
+    except Exception as error:  # a function of the user's may raise anything
+        return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
+    expected = len(one_setting(contents.estimate).weights)
+    return "" if width == expected else f"the one that was passed has {width} features, the run's {expected}"
+
+
+def _predicted(contents: RunContents, answer: AnsweredQuestion) -> AnsweredQuestion:
+    both = [contents.trajectories[n] for n in (answer.first, answer.second) if n in contents.trajectories]
+    if contents.without_posterior or len(both) < 2:
+        return answer
+    if contents.estimate is None:
+        return replace(answer, predicted=0.5)  # without any answer, either is equally probable
+    if contents.posterior is None or contents.features_missing:
+        return answer
+    return replace(answer, predicted=first_preferred_probability(contents.estimate, *both))
+
+
+def _damaged(contents: RunContents, what: str, remedy: str) -> RunContents:
+    return replace(contents, damage=(*contents.damage, ReportWarning(what, remedy)))
+
+
+def _with_environment(contents: RunContents, env: gymnasium.Env | FuncEnv | None) -> RunContents:
+    settings = contents.settings
     try:
         if env is None and settings.environment == "other":
             raise ValueError(f"{settings.env} is an object of your own: pass it to bayespbrl.load as env=")
-        return open_environment(settings.env if env is None else env)
+        return replace(contents, environment=open_environment(settings.env if env is None else env))
     except ValueError as error:
         what = f"The environment cannot be opened ({error}). What needs it is missing here."
         remedy = "Register it first, or call bayespbrl.load(directory, env=...).report() with the object."
-        damage.append(ReportWarning(what, remedy))
-        return None
+        return _damaged(contents, what, remedy)

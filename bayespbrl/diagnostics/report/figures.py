@@ -7,6 +7,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from bayespbrl.diagnostics.axes import finished, number_cells
+
 MAIN, ACCENT = "#1b6ca8", "#c2571a"
 
 
@@ -19,11 +21,7 @@ def plot_value(table: xr.Dataset, axes: Axes, *, optimum: float | None = None) -
         axes.plot(answers[best], value[best], "*", markersize=13, color=ACCENT, label=f"best: {value[best]:.4g}")
     if optimum is not None:
         axes.axhline(optimum, color="0.4", linestyle="--", linewidth=1, label=f"optimum: {optimum:.4g}")
-    axes.set(xlabel="answers", ylabel="mean return of fresh episodes")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend()
-    return axes
+    return finished(axes, xlabel="answers", ylabel="mean return of fresh episodes")
 
 
 def plot_progress(table: xr.Dataset, axes: Axes) -> Axes:
@@ -35,10 +33,7 @@ def plot_progress(table: xr.Dataset, axes: Axes) -> Axes:
         )
     axes.plot(iterations, table["utility"], marker="o", markersize=3.5, color=MAIN, label="expected utility")
     axes.axhline(0, color="0.4", linestyle="--", linewidth=1)
-    axes.set(xlabel="iteration", ylabel="utility relative to the last")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend()
-    return axes
+    return finished(axes, xlabel="iteration", ylabel="utility relative to the last")
 
 
 def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = 1.01) -> Axes:
@@ -46,18 +41,14 @@ def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = 1.01) -> Axes:
     _series(table, axes, {"rhat_max": "largest R̂"}, converged="utility_converged")
     axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")
     low, high = axes.get_ylim()
-    axes.set(ylabel="R̂", ylim=(min(low, 0.9995), max(high, limit + 0.002)))
-    axes.legend()
-    return axes
+    return finished(axes, ylabel="R̂", ylim=(min(low, 0.9995), max(high, limit + 0.002)))
 
 
 def plot_effective_sample_size(table: xr.Dataset, axes: Axes, *, limit: float = 400.0) -> Axes:
     """Effective sample size of the worst margin of each iteration's fit."""
     _series(table, axes, {"effective_sample_size_min": "worst margin"}, converged="utility_converged")
     axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")
-    axes.set(ylabel="effective sample size", ylim=(0, None))
-    axes.legend()
-    return axes
+    return finished(axes, ylabel="effective sample size", ylim=(0, None))
 
 
 def plot_bound(table: xr.Dataset, axes: Axes) -> Axes:
@@ -67,9 +58,7 @@ def plot_bound(table: xr.Dataset, axes: Axes) -> Axes:
     positive = values[np.isfinite(values) & (values > 0)]
     lowest = max(1e-6, positive.min() / 2) if positive.size else 1e-6
     _series(table.assign({name: np.maximum(table[name], lowest) for name in names}), axes, names)
-    axes.set(ylabel="KL to the policy before (nats)", yscale="log")
-    axes.legend()
-    return axes
+    return finished(axes, ylabel="KL to the policy before (nats)", yscale="log")
 
 
 def plot_temperature(table: xr.Dataset, axes: Axes) -> Axes:
@@ -116,8 +105,7 @@ def plot_states(table: xr.Dataset, values: np.ndarray, axes: Axes, *, label: str
     if kind == "grid":
         rows, columns = table.attrs["shape"]
         image: Any = axes.imshow(values.reshape(rows, columns), **limits)
-        axes.set_xticks(range(columns), [str(j + 1) for j in range(columns)])
-        axes.set_yticks(range(rows), [str(i + 1) for i in range(rows)])
+        number_cells(axes, (rows, columns))
         axes.set(xlabel="column", ylabel="row")
     elif kind == "plane":
         x, y = (states[:, d].reshape(table.attrs["shape"]) for d in (0, 1))
@@ -141,13 +129,11 @@ def plot_state_bands(table: xr.Dataset, axes: Axes) -> Axes:
     if table.attrs["kind"] == "line":
         axes.fill_between(states, mean - 2 * sd, mean + 2 * sd, alpha=0.25, linewidth=0, label="± 2 sd")
         axes.plot(states, mean, color=MAIN, label="mean")
-        axes.set(xlabel="observation 0", ylabel="utility")
     else:
         axes.errorbar(states, mean, yerr=2 * sd, fmt="o", markersize=4, capsize=2, color=MAIN, label="mean ± 2 sd")
-        axes.set(xlabel="state", ylabel="utility")
     axes.axhline(0, color="0.6", linewidth=0.8)
-    axes.legend()
-    return axes
+    place = "observation 0" if table.attrs["kind"] == "line" else "state"
+    return finished(axes, whole=False, xlabel=place, ylabel="utility")
 
 
 def plot_trajectories(table: xr.Dataset, axes: Axes) -> Axes:
@@ -157,10 +143,7 @@ def plot_trajectories(table: xr.Dataset, axes: Axes) -> Axes:
         reach = np.abs(np.stack([y - table["lower"].values, table["upper"].values - y]))
         axes.errorbar(x, y, yerr=reach, fmt="none", ecolor="0.7", elinewidth=1, label="90 % interval")
     axes.plot(x, y, "o", markersize=4, color=MAIN)
-    axes.set(xlabel="hidden return (the learner never sees it)", ylabel="inferred utility")
-    if "lower" in table:
-        axes.legend()
-    return axes
+    return finished(axes, whole=False, xlabel="hidden return (the learner never sees it)", ylabel="inferred utility")
 
 
 def plot_answers(table: xr.Dataset, axes: Axes) -> Axes:

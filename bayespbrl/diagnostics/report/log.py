@@ -42,6 +42,13 @@ class AnsweredQuestion:
     row: int | None
     predicted: float = float("nan")
 
+    @property
+    def before(self) -> float:
+        """The predicted probability of the answer that was given; NaN where the model does not use it."""
+        if self.row is None:
+            return float("nan")
+        return self.predicted if self.answer is Answer.FIRST else 1 - self.predicted
+
 
 @dataclass(frozen=True)
 class RunLog:
@@ -51,23 +58,20 @@ class RunLog:
       state: the learner's, with None in place of trajectories, policy and estimate.
       answers: in their order, without those taken back.
       summaries: of the completed iterations.
-      collected: number of iterations with trajectories.
       damage: one warning for each thing that cannot be read.
     """
 
     state: LearnerState
     answers: tuple[AnsweredQuestion, ...]
     summaries: tuple[Summary, ...]
-    collected: int
     damage: tuple[ReportWarning, ...]
 
 
 def read_log(path: Path, settings: Settings) -> RunLog:
     """Read `events.jsonl` and `summary.json` of the run directory `path`, complete or not."""
     damage: list[ReportWarning] = []
-    state, answers, collected = _applied(_surviving_events(path, damage), settings, damage)
-    summaries = _summaries(path, state, damage)
-    return RunLog(state, tuple(answers), summaries, collected, tuple(damage))
+    state, answers = _applied(_surviving_events(path, damage), settings, damage)
+    return RunLog(state, tuple(answers), _summaries(path, state, damage), tuple(damage))
 
 
 def _damage(text: str) -> ReportWarning:
@@ -101,9 +105,9 @@ def _surviving_events(path: Path, damage: list[ReportWarning]) -> Sequence[Event
 
 def _applied(
     log: Sequence[Event], settings: Settings, damage: list[ReportWarning]
-) -> tuple[LearnerState, list[AnsweredQuestion], int]:
-    """The learner's state without its heavy parts, the answers, and the number of iterations with trajectories."""
-    state, answers, collected = LearnerState(None), [], 0
+) -> tuple[LearnerState, list[AnsweredQuestion]]:
+    """The learner's state without its heavy parts, and the answers."""
+    state, answers = LearnerState(None), []
     # stand-ins: applying an event only needs the heavy parts to be there
     parts = {"trajectories": [None] * settings.rollouts.trajectories_per_iteration, "policy": None, "estimate": None}
     for event in log:
@@ -113,14 +117,12 @@ def _applied(
         except ValueError as error:
             damage.append(_damage(f"events.jsonl: {error}; what follows is left out"))
             break
-        if event["event"] == "collected":
-            collected += 1
-        elif event["event"] == "answered" and query is not None:
+        if event["event"] == "answered" and query is not None:
             after = len(state.preferences.pairs)
             row = after - 1 if after > pairs else None  # the pair that was asked about is the last of its answer's
             answer = Answer(event["answer"])
             answers.append(AnsweredQuestion(query.number, state.iteration + 1, query.first, query.second, answer, row))
-    return state, answers, collected
+    return state, answers
 
 
 def _summaries(path: Path, state: LearnerState, damage: list[ReportWarning]) -> tuple[Summary, ...]:

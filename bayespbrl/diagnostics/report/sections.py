@@ -50,7 +50,7 @@ def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
         caption += " Points above one another are iterations without a question."
     first, last = float(iterations["value"][0]), float(iterations["value"][-1])
     alt = f"Learning curve: value from {number(first)} to {number(last)} over {int(iterations['answers'][-1])} answers."
-    blocks = [drawn("learning", panels, caption, alt, columns=1, size=(7.6, 3.3))]
+    blocks = [drawn("learning", panels, caption, alt, size=(7.6, 3.3))]
     if of_states(contents.estimate) and not contents.features_missing:
         curve = [("By the inferred utility", partial(figures.plot_progress, progress_table(contents)))]
         caption = (
@@ -60,7 +60,7 @@ def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
             "and contains zero, nothing more was gained. Whether the gain is real, the trajectories show."
         )
         alt = "The inferred utility of each iteration's trajectories."
-        blocks.append(drawn("progress", curve, caption, alt, columns=1, size=(7.6, 3.0)))
+        blocks.append(drawn("progress", curve, caption, alt, size=(7.6, 3.0)))
     return [], blocks
 
 
@@ -85,7 +85,6 @@ def convergence_of_fits(contents: RunContents, iterations: xr.Dataset) -> Body:
         [(f"The fit of iteration {contents.estimate_iteration}", partial(plot_convergence, result))],
         "Effective sample size of every margin of the last fit, in the bulk of its distribution and in its tails.",
         f"Effective sample sizes of {result.sizes['preference']} margins.",
-        columns=1,
         size=(7.6, 2.8),
     )
     return [], [every, margins, _rank_plots(contents.posterior, result)]
@@ -126,7 +125,6 @@ def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
         "(pool-adjacent-violators). Calibrated predictions stay within the band. A curve steeper than the diagonal is "
         "underconfident, a flatter one overconfident.",
         f"Reliability curve of {total} predictions.",
-        columns=1,
         size=(5.6, 4.0),
     )
     few = ["The band is wide with so few answers: little can be concluded."] if total < FEW_ANSWERS else []
@@ -203,7 +201,7 @@ def sensitivity_to_model(contents: RunContents) -> Body:
     caption = "Power-scaling sensitivity of each preference's margin; the dashed line is the threshold."
     alt = f"Sensitivity of {total} margins to prior and likelihood."
     panels = [("", partial(plot_sensitivity, result))]
-    return text, [drawn("sensitivity", panels, caption, alt, columns=1, size=(7.6, 3.0))]
+    return text, [drawn("sensitivity", panels, caption, alt, size=(7.6, 3.0))]
 
 
 def all_iterations(iterations: xr.Dataset) -> Body:

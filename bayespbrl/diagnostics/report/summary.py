@@ -1,5 +1,7 @@
 """The summary of a report: sentences on the value reached, the posterior's convergence and the predictions."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import xarray as xr
 
@@ -73,35 +75,33 @@ def _convergence(contents: RunContents) -> str:
     )
 
 
-def _ranking(contents: RunContents, ranking: xr.Dataset) -> list[str]:
+def _ranking(contents: RunContents, ranking: xr.Dataset) -> Iterator[str]:
     """How certain the order of the newest trajectories is, and that the undominated one is the best."""
     total = ranking.sizes["trajectory"]
     if total < 2:
-        return []
+        return
     better = ranking["better_probability"].values[np.triu_indices(total, k=1)]
     certainty = float(np.mean(np.maximum(better, 1 - better)))
-    sentences = [
+    yield (
         f"Of two among {total} trajectories, the newest and the undominated one, the better one is known with "
         f"probability {percent(certainty)} on average (50 % is chance)."
-    ]
+    )
     for best in set(contents.preferences.undominated[-1:]) & set(ranking["trajectory"].values.tolist()):
         wins = percent(float(ranking["best_probability"].sel(trajectory=best)))
-        sentences.append(f"With probability {wins} the undominated trajectory, number {best}, is the best of these.")
-    return sentences
+        yield f"With probability {wins} the undominated trajectory, number {best}, is the best of these."
 
 
-def _predictions(answers: xr.Dataset, scores: xr.Dataset) -> list[str]:
+def _predictions(answers: xr.Dataset, scores: xr.Dataset) -> Iterator[str]:
     """How probable the answers were before they were given; those of the first iteration meet the prior, at ½ each."""
     before = answers["before"].values[answers["iteration"].values > 1]
     before = before[np.isfinite(before)]
-    if not before.size:
-        return []
-    with np.errstate(divide="ignore"):
-        mean = np.exp(np.mean(np.log(before)))
-    return [
-        f"The answers since the first iteration had a probability of {percent(mean)} before they were given (geometric "
-        f"mean); {percent(np.mean(before > 0.5))} of them had more than one half. {_calibration(scores)}"
-    ]
+    if before.size:
+        with np.errstate(divide="ignore"):
+            mean = np.exp(np.mean(np.log(before)))
+        yield (
+            f"The answers since the first iteration had a probability of {percent(mean)} before they were given "
+            f"(geometric mean); {percent(np.mean(before > 0.5))} of them had more than one half. {_calibration(scores)}"
+        )
 
 
 def _calibration(scores: xr.Dataset) -> str:
@@ -114,14 +114,14 @@ def _calibration(scores: xr.Dataset) -> str:
     return text + ("underconfident." if score > expected + 2 * sd else "no sign of overconfidence.")
 
 
-def _undominated(contents: RunContents) -> list[str]:
+def _undominated(contents: RunContents) -> Iterator[str]:
     """The best so far, and for how many comparisons it has been so."""
     best = contents.preferences.undominated
     if not best:
-        return []
+        return
     size = contents.settings.rollouts.trajectories_per_iteration
     named = ", ".join(f"{n} (of iteration {n // size + 1})" for n in best)
-    text = f"Undominated among all compared trajectories: number {named}."
     compared = [answer for answer in contents.answers if answer.answer is not Answer.SKIP]
     since = max(0, sum(best[-1] in (answer.first, answer.second) for answer in compared) - 1)  # one made it the best
-    return [text + (f" {count(since, 'comparison')} since then found nothing better." if since else "")]
+    unbeaten = f" {count(since, 'comparison')} since then found nothing better." if since else ""
+    yield f"Undominated among all compared trajectories: number {named}.{unbeaten}"

@@ -32,17 +32,13 @@ def iterations_table(summaries: Sequence[Summary]) -> xr.Dataset:
     A list of numbers becomes its mean. What the schedule and the choice of hyperparameters reported becomes variables
     `schedule …` and `hyperparameters …`, texts where they are no numbers.
     """
-    columns: dict[str, Sequence[float] | Sequence[str]] = {
-        name: [_number(summary.get(name)) for summary in summaries] for name in MEASURED
-    }
+    columns: dict[str, list[Any]] = {name: [_number(summary.get(name)) for summary in summaries] for name in MEASURED}
     for group in ("schedule", "hyperparameters"):
         rows = [_flat(summary.get(group)) for summary in summaries]
         for key in dict.fromkeys(key for row in rows for key in row):
             values = [row.get(key) for row in rows]
-            texts = any(isinstance(value, str) for value in values)
-            columns[f"{group} {key}"] = (
-                ["" if v is None else str(v) for v in values] if texts else [_number(v) for v in values]
-            )
+            convert = _text if any(isinstance(value, str) for value in values) else _number
+            columns[f"{group} {key}"] = [convert(value) for value in values]
     data = {name: ("iteration", np.asarray(values)) for name, values in columns.items()}
     return xr.Dataset(data, coords={"iteration": np.arange(1, len(summaries) + 1)})
 
@@ -63,23 +59,15 @@ def answers_table(contents: RunContents) -> xr.Dataset:
       less that of the other by the last estimate, and its posterior standard deviation `margin_sd`.
     """
     answers = contents.answers
-    names = ("before", "probability", "margin", "margin_sd")
-    columns = {name: np.full(len(answers), np.nan) for name in names}
-    fitted = 0 if contents.estimate is None else contents.estimate.quality.pairs
-    for k, answer in enumerate(answers):
-        if answer.row is None:
-            continue
-        columns["before"][k] = answer.predicted if answer.answer is Answer.FIRST else 1 - answer.predicted
-        if answer.row < fitted:
-            columns["probability"][k], columns["margin"][k], columns["margin_sd"][k] = _by_last_estimate(
-                contents, answer
-            )
     data: Variables = {
         name: ("answer", np.asarray([getattr(answer, name) for answer in answers]))
-        for name in ("question", "iteration", "first", "second")
+        for name in ("question", "iteration", "first", "second", "before")
     }
     data["said"] = ("answer", np.array([str(answer.answer) for answer in answers], dtype=np.str_))
-    return xr.Dataset(data | {name: ("answer", values) for name, values in columns.items()})
+    columns = np.reshape([_by_last_estimate(contents, answer) for answer in answers], (-1, 3)).T
+    for name, column in zip(("probability", "margin", "margin_sd"), columns, strict=True):
+        data[name] = ("answer", column)
+    return xr.Dataset(data)
 
 
 def _by_last_estimate(contents: RunContents, answer: AnsweredQuestion) -> tuple[float, float, float]:
@@ -88,11 +76,13 @@ def _by_last_estimate(contents: RunContents, answer: AnsweredQuestion) -> tuple[
     NaN where these are unknown: without a posterior, or where a trajectory or its features are missing.
     """
     estimate, tree = contents.estimate, contents.posterior
+    if estimate is None or answer.row is None or answer.row >= estimate.quality.pairs:
+        return np.nan, np.nan, np.nan
     both = _preferred_and_dominated(contents, answer)
     if tree is not None and not is_average(estimate):
         margins = np.asarray(tree["posterior"]["margins"])[:, :, answer.row]
         probability = np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row]))
-    elif both is None or estimate is None:
+    elif both is None:
         return np.nan, np.nan, np.nan
     elif tree is None:
         preferred, dominated = estimate.trajectory_utilities(both)
@@ -131,9 +121,12 @@ def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
     Raises:
       ValueError: no estimate, or features that were not passed again; no trajectory that can be read.
     """
-    estimate, states = contents.estimate, _observed(contents)
+    estimate = contents.estimate
+    if not contents.trajectories:
+        raise ValueError("trajectories: expected at least one that can be read, got none")
     if not of_states(estimate):
         raise ValueError("utility: expected an estimate of the utility of states, got none")
+    states = np.concatenate([trajectory.states for trajectory in contents.trajectories.values()])
     shown, attrs = _states_to_show(contents, states, np.random.default_rng(seed))
     features = one_setting(estimate).features(shown)
     lengths = np.linalg.norm(features, axis=1)
@@ -239,12 +232,6 @@ def _states_to_show(
     return states[chosen], {"kind": "cloud", "dimensions": tuple(int(d) for d in dimensions)}
 
 
-def _observed(contents: RunContents) -> np.ndarray:
-    if not contents.trajectories:
-        raise ValueError("trajectories: expected at least one that can be read, got none")
-    return np.concatenate([trajectory.states for trajectory in contents.trajectories.values()])
-
-
 def _preferred_and_dominated(contents: RunContents, answer: AnsweredQuestion) -> tuple[Trajectory, Trajectory] | None:
     """The two trajectories of an answer; None where one of them, or the features, are missing."""
     preferred, dominated = answer.first, answer.second
@@ -260,6 +247,10 @@ def _number(value: object) -> float:
     if isinstance(value, list) and value:
         return float(np.mean([_number(entry) for entry in value]))
     return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def _text(value: object) -> str:
+    return "" if value is None else str(value)
 
 
 def _flat(value: object) -> dict[str, Any]:

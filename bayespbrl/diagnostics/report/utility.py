@@ -53,7 +53,7 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
         )
         alt = f"Probabilities of the ranks of {ranking.sizes['trajectory']} trajectories."
         panels = [("Ranking", partial(plot_ranking, ranking))]
-        blocks.append(drawn("ranking", panels, caption, alt, columns=1, size=(6.0, 3.6)))
+        blocks.append(drawn("ranking", panels, caption, alt, size=(6.0, 3.6)))
     return text, blocks
 
 
@@ -78,7 +78,7 @@ def _trajectories(compared: xr.Dataset) -> Picture:
         caption += " The intervals are the posterior's, for the utility of the whole trajectory."
     alt = f"Inferred utility against hidden return of {compared.sizes['trajectory']} trajectories."
     panels = [("Trajectories", partial(figures.plot_trajectories, compared))]
-    return drawn("trajectories", panels, caption, alt, columns=1, size=(6.0, 3.3))
+    return drawn("trajectories", panels, caption, alt, size=(6.0, 3.3))
 
 
 def _maps(table: xr.Dataset) -> list[Picture]:
@@ -86,7 +86,7 @@ def _maps(table: xr.Dataset) -> list[Picture]:
     if table.attrs["kind"] in ("list", "line"):
         bands = [("Utility of the states", partial(figures.plot_state_bands, table))]
         caption = f"Utility {where}: posterior mean ± two standard deviations. The scale is arbitrary."
-        return [drawn("utility", bands, caption, f"Utility {where}.", columns=1, size=(7.6, 3.2))]
+        return [drawn("utility", bands, caption, f"Utility {where}.", size=(7.6, 3.2))]
     blank = np.where(table["reached"].values, 0.0, np.nan)
     used = ("used", "Utility that the learner used", "utility", "viridis")
     shown, caption = [used], f"The utility {where}. The scale is arbitrary."
