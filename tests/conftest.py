@@ -64,13 +64,19 @@ def gridworld_copy(gridworld_run, tmp_path):
 
 
 @pytest.fixture(scope="session")
-def swing_up_run(tmp_path_factory):
-    """Directory of a finished swing-up run with all options of uncertainty; not to be changed."""
+def swing_up_learner(tmp_path_factory):
+    """A finished swing-up run with all options of uncertainty: its directory and its learner; not to be changed."""
     directory = tmp_path_factory.mktemp("runs") / "swing-up"
     uncertainty = {"schedule": "confidence", "query": "information-when-unsure", "hyperparameters": "averaged"}
     options = {"updates_per_iteration": 2, "unasked_iterations": 1, "iterations": 4, "centres": 30, "seed": 3}
-    bayespbrl.start("swing-up", directory, **uncertainty, **options, **QUICK).run(bayespbrl.ReturnExpert())
-    return directory
+    learner = bayespbrl.start("swing-up", directory, **uncertainty, **options, **QUICK)
+    return directory, learner.run(bayespbrl.ReturnExpert())
+
+
+@pytest.fixture(scope="session")
+def swing_up_run(swing_up_learner):
+    """The directory of `swing_up_learner`'s run."""
+    return swing_up_learner[0]
 
 
 @pytest.fixture

@@ -7,8 +7,6 @@ from bayespbrl import Learner, ReturnExpert, queries
 from bayespbrl.features import OneHot, RadialBasis
 from bayespbrl.models import PreferenceModel
 from bayespbrl.queries import InformationWhenUnsure
-from bayespbrl.runs.iteration_files import read_iteration
-from bayespbrl.runs.run import start
 from bayespbrl.trajectories import Trajectory, trajectory_features
 from bayespbrl.utility.averaging import BANDWIDTH_MULTIPLES, MOST_BANDWIDTHS, average_utility
 from bayespbrl.utility.comparisons import Comparisons
@@ -146,27 +144,6 @@ def test_of_many_dimensions_some_length_scales_are_taken():
     assert 1 < len(estimate.multiples) <= MOST_BANDWIDTHS
     assert len(np.unique(estimate.multiples, axis=0)) == len(estimate.multiples)
     assert set(estimate.multiples.flat) <= set(BANDWIDTH_MULTIPLES)
-
-
-@pytest.mark.slow
-def test_a_run_keeps_the_average(tmp_path):
-    learner = start("swing-up", tmp_path / "run", iterations=2, centres=20, **ALL, **QUICK)
-    learner.run(ReturnExpert())
-    estimate = read_iteration(tmp_path / "run" / "iterations" / "0002.nc", "improved")["estimate"]
-    states = learner.trajectories[0].states
-    assert len(estimate.multiples) > 1
-    np.testing.assert_array_equal(estimate.utilities(states), learner.estimate.utilities(states))
-    np.testing.assert_array_equal(
-        estimate.utilities_and_draws(states)[1], learner.estimate.utilities_and_draws(states)[1]
-    )
-    report = learner_report(tmp_path / "run")
-    assert f"an average over {len(estimate.multiples)} choices of length scales" in report
-
-
-def learner_report(directory):
-    from bayespbrl.diagnostics.report import write_report
-
-    return write_report(directory).read_text()
 
 
 @pytest.mark.slow

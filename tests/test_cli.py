@@ -127,6 +127,7 @@ def test_resuming_a_finished_run_says_so(monkeypatch, capsys, finished):
     assert (out / "events.jsonl").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_resuming_draws_the_pictures_that_a_finished_run_lacks(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     options = {"utility": "linear-program", "iterations": 1, "max_steps": 20, "expert": "other"}
@@ -145,7 +146,8 @@ def test_nobody_answers_for_an_expert_of_the_users_own(monkeypatch, capsys, tmp_
         monkeypatch, capsys, "run", "gridworld", *QUICK, "--expert", "other", "--out", tmp_path / "run"
     )
     assert not (tmp_path / "run").exists()
-    bayespbrl.start("gridworld", tmp_path / "own", utility="linear-program", iterations=2, expert="other").ask()
+    options = {"utility": "linear-program", "iterations": 2, "max_steps": 20}
+    bayespbrl.start("gridworld", tmp_path / "own", **options, expert="other").ask()
     before = (tmp_path / "own" / "events.jsonl").read_bytes()
     assert "got other" in refused(monkeypatch, capsys, "resume", tmp_path / "own")
     assert (tmp_path / "own" / "events.jsonl").read_bytes() == before

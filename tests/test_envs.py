@@ -73,6 +73,7 @@ def test_the_environment_is_its_pure_functions(env):
         assert observed[2] == bool(expected[2])
 
 
+@pytest.mark.slow
 def test_the_pure_functions_follow_their_callers_precision(env):
     if isinstance(env.observation_space, Discrete):
         assert env.unwrapped.dynamics.initial(jax.random.key(0)).dtype == jnp.int32

@@ -268,6 +268,7 @@ def test_acrobot_goal_is_a_tip_one_metre_above_the_bar():
     assert bool(acrobot.DYNAMICS.terminal(jnp.array([angle + 0.01, 0.0, 0.0, 0.0])))
 
 
+@pytest.mark.slow
 def test_acrobot_torque_is_clipped_before_the_noise():
     keys = jax.random.split(jax.random.key(0), 500)
     step = jax.vmap(lambda key: acrobot.DYNAMICS.transition(jnp.zeros(4), jnp.array([7.0]), key))
@@ -277,6 +278,7 @@ def test_acrobot_torque_is_clipped_before_the_noise():
     assert speeds.max() - speeds.min() > 0.9 * (highest - lowest)
 
 
+@pytest.mark.slow
 def test_acrobot_pumping_the_elbow_reaches_the_goal_and_its_return_is_minus_the_steps():
     @jax.tree_util.register_dataclass
     @dataclass(frozen=True)

@@ -149,6 +149,7 @@ def test_the_policy_is_the_full_process_about_the_centre_of_the_action_range():
     np.testing.assert_allclose(variance[:, 0], full_variance, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_traceable_moments_equal_the_matrix_products():
     rng = np.random.default_rng(8)
     points, targets, weights = some_samples(300, rng)

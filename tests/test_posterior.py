@@ -297,12 +297,12 @@ def test_simulation_based_calibration_of_the_margins(number, dimension, scale, s
             differences * signs[:, None],
             prior_scale=scale,
             steepness=steepness,
-            num_samples=100,
-            max_samples=100,
+            num_samples=50,
+            max_samples=50,
             seed=trial,
         )
         # a fixed direction of w: margins flipped by their own answer would be no function of w alone
-        drawn = tree["posterior/utility_weights"][:, ::4, 0].values.ravel()
+        drawn = tree["posterior/utility_weights"][:, ::2, 0].values.ravel()
         ranks.append(np.sum(drawn < w[0]))
     counts, _ = np.histogram(ranks, bins=np.linspace(-0.5, 100.5, 6))
     assert stats.chisquare(counts, 120 * np.diff(np.ceil(np.linspace(-0.5, 100.5, 6))) / 101).pvalue > 1e-3

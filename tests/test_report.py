@@ -220,6 +220,21 @@ def test_the_answers_have_the_probabilities_of_an_averaged_utility(swing_up_run)
     assert "gives the answers their probabilities" in read(write_report(swing_up_run)).text
 
 
+@pytest.mark.slow
+def test_a_run_keeps_the_average_and_the_report_says_what_it_is_over(swing_up_learner):
+    directory, learner = swing_up_learner
+    estimate = read_iteration(directory / "iterations" / "0004.nc", "improved")["estimate"]
+    states = learner.trajectories[0].states
+    assert len(estimate.multiples) > 1
+    np.testing.assert_array_equal(estimate.utilities(states), learner.estimate.utilities(states))
+    for kept, learned in zip(
+        estimate.utilities_and_draws(states), learner.estimate.utilities_and_draws(states), strict=True
+    ):
+        np.testing.assert_array_equal(kept, learned)
+    report = write_report(directory).read_text()
+    assert f"an average over {len(estimate.multiples)} choices of length scales" in report
+
+
 def test_few_predictions_are_no_ground_for_a_warning(contents):
     tables = report_tables.iterations_table(contents.iterations), report_tables.answers_table(contents)
     for total, expected in ((9, False), (10, True)):
@@ -431,6 +446,7 @@ def test_an_answer_that_the_estimate_contradicts_is_named(tmp_path):
     assert any("contradicts 2 answers: 1–2" in text for text in warned(replace(contents, answers=reversed_answers)))
 
 
+@pytest.mark.slow
 def test_what_a_schedule_and_the_choice_of_hyperparameters_reported_is_shown(gridworld_copy):
     rows = [
         {
@@ -536,6 +552,7 @@ def test_an_environment_that_cannot_be_opened_costs_only_what_needs_it(gridworld
     assert "largest R̂" in text
 
 
+@pytest.mark.slow
 def test_a_feature_function_that_fails_costs_only_its_sections(tmp_path):
     calls = []
 
@@ -701,10 +718,8 @@ def test_importing_the_package_does_not_import_the_report():
 
 
 @pytest.mark.slow
-def test_a_report_of_a_swing_up_run_draws_the_utility_over_the_plane(tmp_path, drawn):
-    directory = tmp_path / "run"
-    bayespbrl.start("swing-up", directory, iterations=3, centres=100, evaluation_episodes=5).run(ReturnExpert())
-    path = write_report(directory)
+def test_a_report_of_a_swing_up_run_draws_the_utility_over_the_plane(swing_up_copy, drawn):
+    path = write_report(swing_up_copy)
     text = read(path).text
     assert "over the observed range" in text
     assert "could not be made" not in text

@@ -435,7 +435,9 @@ def test_a_summary_that_a_killed_process_left_old_is_brought_up_to_date(copy):
     assert (new["finished"], len(new["iterations"])) == (True, 3)
 
 
-@pytest.mark.parametrize("fails", ["fsync", "interrupt", "summary"])
+@pytest.mark.parametrize(
+    "fails", [*(pytest.param(kind, marks=pytest.mark.slow) for kind in ("fsync", "interrupt")), "summary"]
+)
 def test_an_event_that_could_not_be_kept_is_taken_back_and_can_be_tried_again(tmp_path, monkeypatch, straight, fails):
     directory = tmp_path / "run"
     learner = start(directory)

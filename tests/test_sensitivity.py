@@ -43,6 +43,7 @@ def test_utility_that_no_answer_constrains_depends_on_the_prior_scale_alone(tree
     np.testing.assert_allclose(*of_component(result, "prior"), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_posterior_is_insensitive_to_answers_without_information():
     tree = sample_posterior(DIFFERENCES, likelihood="logistic", steepness=1e-4, **SAMPLING)
     result = sensitivity(tree)
@@ -50,7 +51,7 @@ def test_the_posterior_is_insensitive_to_answers_without_information():
     assert np.all(of_component(result, "prior")[:2] > 0.06)
 
 
-@pytest.mark.parametrize("steepness", [1e-14, 1e-8])
+@pytest.mark.parametrize("steepness", [pytest.param(1e-14, marks=pytest.mark.slow), 1e-8])
 def test_the_posterior_is_insensitive_to_answers_equally_likely_but_for_rounding(steepness):
     tree = sample_posterior(DIFFERENCES, steepness=steepness, likelihood="logistic", **SAMPLING)
     assert np.ptp(tree["log_likelihood"]["answers"].values) > 0

@@ -22,7 +22,7 @@ def test_a_stored_run_reads_as_it_did(name):
     assert [summary["value"] for summary in run.iterations] == expected["values"]
 
 
-@pytest.mark.parametrize("name", ["gridworld", "swing-up"])
+@pytest.mark.parametrize("name", ["gridworld", pytest.param("swing-up", marks=pytest.mark.slow)])
 def test_a_stored_run_goes_on(name, tmp_path):
     shutil.copytree(STORED / name, tmp_path / name)
     learner = bayespbrl.resume(tmp_path / name)

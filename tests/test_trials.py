@@ -170,6 +170,7 @@ def redrawn(tmp_path_factory):
         return run_trials("gridworld", tmp_path_factory.mktemp("redrawn"), seeds=range(5, 8), **TIED)
 
 
+@pytest.mark.slow
 def test_a_trial_that_meets_no_preference_is_left_and_the_next_unused_seed_takes_its_place(redrawn):
     assert redrawn.table["seed"].values.tolist() == [5, 8, 9]
     assert redrawn.table.attrs["redraws"] == 2
@@ -185,6 +186,7 @@ def test_a_trial_that_meets_no_preference_is_left_and_the_next_unused_seed_takes
         assert {row["seed"] for row in csv.DictReader(file)} == {"5", "8", "9"}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_a_second_call_redraws_nothing_again_and_a_lost_trial_comes_back(redrawn):
     before = {file: file.stat().st_mtime_ns for file in redrawn.path.rglob("seed-[5679]/**/*") if file.is_file()}
@@ -209,6 +211,7 @@ def test_the_seeds_of_a_study_do_not_depend_on_which_trial_ends_first(order):
     assert seeds.with_outcome(False) == [11, 12, 13]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_a_study_that_hardly_ever_meets_a_preference_gives_up(tmp_path, monkeypatch):
     monkeypatch.setattr(trials_module, "MOST_SEEDS_A_TRIAL", 2)

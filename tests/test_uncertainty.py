@@ -11,7 +11,7 @@ import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bayespbrl import Learner, ReturnExpert
+from bayespbrl import Learner, ReturnExpert, load
 from bayespbrl.diagnostics.uncertainty import (
     greedy_probabilities,
     plot_greedy,
@@ -145,6 +145,7 @@ def grid():
     return learner.run(ReturnExpert())
 
 
+@pytest.mark.slow
 def test_successor_features_are_the_discounted_visits_to_come_under_the_observed_frequencies(grid):
     steps, table, discount = transitions(grid.trajectories), grid.policy.table, grid.settings.critic.discount
     counts = np.zeros((125, 25))
@@ -159,12 +160,13 @@ def test_successor_features_are_the_discounted_visits_to_come_under_the_observed
     np.testing.assert_allclose(found.sum(axis=1), 1 / (1 - discount), rtol=1e-5)  # one visit a step, for ever
 
 
-def test_draws_of_q_are_draws_of_the_weights_times_successor_features(grid):
+def test_draws_of_q_are_draws_of_the_weights_times_successor_features(gridworld_run):
+    learner = load(gridworld_run).learner
     states, actions = np.array([0, 12, 24]), np.arange(5)
-    successors = successor_features(grid)
-    q = q_draws(grid.estimate, successors, states, actions, number=10**9)["q"]
+    successors = successor_features(learner)
+    q = q_draws(learner.estimate, successors, states, actions, number=10**9)["q"]
     assert q.dims == ("chain", "draw", "state", "action")
-    weights = grid.estimate.posterior["posterior"]["utility_weights"].values / grid.estimate.scale
+    weights = learner.estimate.posterior["posterior"]["utility_weights"].values / learner.estimate.scale
     for (i, state), action in itertools.product(enumerate(states), actions):
         row = successors(np.array([state]), np.array([action]))[0]
         np.testing.assert_allclose(q[:, :, i, action], weights @ row, rtol=1e-9, atol=1e-9)
