@@ -24,7 +24,6 @@ from bayespbrl.settings import Settings, settings_for
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
 from bayespbrl.utility.comparisons import Comparisons
 from bayespbrl.utility.estimate import UtilityEstimate
-from bayespbrl.utility.hyperparameters import HyperparameterChoice
 from bayespbrl.utility.inference import estimate
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
@@ -245,7 +244,7 @@ class Learner:
         """Steps 1 and 2, and the value of the new policy, which the learner does not see."""
         state, options = self.state, self.settings.rollouts
         clock = [time.perf_counter()]
-        utility, choice = self._estimate()
+        utility = self._estimate()
         clock.append(time.perf_counter())
         improved, bound = self._update(utility, transitions(state.trajectories))
         clock.append(time.perf_counter())
@@ -267,7 +266,7 @@ class Learner:
             **improved.summary(),
             "seconds": seconds,
             "schedule": bound.summary(),
-            "hyperparameters": None if choice is None else choice.summary(),
+            "hyperparameters": utility.hyperparameters(),
         }
         self._record(
             {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
@@ -276,12 +275,17 @@ class Learner:
             estimate=utility,
         )
 
-    def _estimate(self) -> tuple[UtilityEstimate, HyperparameterChoice | None]:
+    def _estimate(self) -> UtilityEstimate:
         """Step 1."""
         state, settings = self.state, self.settings
         rng = self._rng(FEATURES, 2 * state.iteration)
         return estimate(
-            Comparisons.among(state.trajectories, state.preferences.pairs, discount=settings.trajectory_discount),
+            Comparisons.among(
+                state.trajectories,
+                state.preferences.pairs,
+                discount=settings.trajectory_discount,
+                ties=state.preferences.ties,
+            ),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),
             settings.estimation,
             settings.model,

@@ -56,7 +56,8 @@ class Preferences:
     """The ordered pairs and the undominated trajectories, by the numbers of the trajectories.
 
     Attributes:
-      pairs: (preferred, dominated) for each τᵢ ≻ τⱼ; there are K of them (eq. 8).
+      pairs: (preferred, dominated) for each τᵢ ≻ τⱼ.
+      ties: pairs that were answered with "no difference". There are K pairs and ties (eq. 8).
       undominated: the best so far, which tie with each other; the newest last.
       answers: number of answered questions, ties included.
     """
@@ -64,6 +65,7 @@ class Preferences:
     pairs: tuple[tuple[int, int], ...] = ()
     undominated: tuple[int, ...] = ()
     answers: int = 0
+    ties: tuple[tuple[int, int], ...] = ()
 
     def start(self, trajectory: int) -> "Preferences":
         """The same preferences with `trajectory` as the first undominated one."""
@@ -73,8 +75,7 @@ class Preferences:
         """The preferences after one comparison of a newcomer with the newest undominated trajectory.
 
         A better newcomer is preferred over every undominated trajectory and replaces them. Over a worse one, every
-        undominated trajectory is preferred. In a tie (`preferred=None`) the newcomer joins them, and no ordered pair is
-        stored, as in the authors' published implementation.
+        undominated trajectory is preferred. In a tie (`preferred=None`) the newcomer joins them, and the pair is a tie.
 
         Raises:
           ValueError: an incumbent that is not the newest undominated one, or a preferred that is neither of the two.
@@ -85,12 +86,13 @@ class Preferences:
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
         answers = self.answers + 1
         if preferred is None:
-            return Preferences(self.pairs, (*self.undominated, newcomer), answers)
+            tie = (newcomer, incumbent)
+            return Preferences(self.pairs, (*self.undominated, newcomer), answers, (*self.ties, tie))
         if preferred == newcomer:
             new_pairs = tuple((newcomer, member) for member in self.undominated)
-            return Preferences(self.pairs + new_pairs, (newcomer,), answers)
+            return Preferences(self.pairs + new_pairs, (newcomer,), answers, self.ties)
         new_pairs = tuple((member, newcomer) for member in self.undominated)
-        return Preferences(self.pairs + new_pairs, self.undominated, answers)
+        return Preferences(self.pairs + new_pairs, self.undominated, answers, self.ties)
 
     def differences(self, trajectory_features: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
         """ψ(preferred) − ψ(dominated) for each pair (eq. 5), from ψ of all trajectories."""

@@ -6,7 +6,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "gridworld": {
         "iterations": 25,
         "discount": 0.995,  # the expert judges 300 undiscounted steps
-        "hyperparameters": "given",  # one-hot features have no length scale
         "exploration_hold": 3,  # noise drawn at each step averages out
     },
     "swing-up": {
@@ -24,7 +23,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "bicycle": {
         "iterations": 25,
         "kl_bound": 0.3,  # the paper's authors'
-        "hyperparameters": "given",  # four length scales are more than these answers can tell
         "utility_bandwidth_factor": 12.0,  # nearly a quadratic utility
         "centres": 300,  # as good as the paper's 400
         "bandwidth_factor": 2.0,

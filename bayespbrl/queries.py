@@ -112,7 +112,7 @@ def thompson(situation: QuerySituation) -> list[int]:
 def information(situation: QuerySituation) -> list[int]:
     """The comparison with the incumbent whose answer has the highest `expected_information` first."""
     utilities, incumbent = situation.draws()
-    scores = expected_information(utilities, incumbent, likelihood=situation.estimate.likelihood)
+    scores = expected_information(utilities, incumbent, likelihood=situation.estimate.likelihood(QUERY_DRAWS))
     return _ordered(situation, utilities, scores)
 
 
@@ -201,7 +201,8 @@ def expected_information(
 
     Args:
       utilities, incumbent: posterior draws, shapes (S, n) and (S,).
-      likelihood: of an answer given its margin, the difference of the two utilities.
+      likelihood: of an answer given its margin, the difference of the two utilities; its parameters are numbers, or
+        have shape (S, 1), one for each draw.
 
     Returns:
       shape (n,).

@@ -153,6 +153,8 @@ class Settings:
         parts: dict[str, dict[str, Any]] = {name: {} for name in ("", *PARTS)}
         for name, value in options.items():
             parts[OPTIONS[name]][name] = value
+        if parts["estimation"].get("hyperparameters", Estimation.hyperparameters) == "inferred":
+            parts["model"] = {"steepness": None, "lapse_rate": None} | parts["model"]
         own = parts.pop("")
         return cls(env, **own, **{name: PARTS[name](**chosen) for name, chosen in parts.items()})
 

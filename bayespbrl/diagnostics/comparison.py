@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from bayespbrl import checks
 from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_groups, held_out_probabilities
-from bayespbrl.models import PreferenceModel
+from bayespbrl.models import Answers, PreferenceModel
 
 
 def compare_likelihoods(
@@ -85,7 +85,7 @@ def _held_out_log_probability(
     for held_out in np.unique(fold):
         asked = fold == held_out
         probabilities, fit_converged = held_out_probabilities(
-            differences, model, ~asked, asked, indifferent=tied, **sampling_options
+            differences, model, ~asked, asked, answers=Answers(tied if tied.any() else None), **sampling_options
         )
         chosen = probabilities[np.arange(len(probabilities)), outcome[asked]]
         with np.errstate(divide="ignore"):  # an answer that the model rules out: log 0

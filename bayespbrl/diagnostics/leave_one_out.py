@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_probabilities, refit, tied_rows
+from bayespbrl.models.posterior_tree import settings_of
 
 PARETO_K_LIMIT = 0.7
 
@@ -26,16 +27,15 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
       sampling_options: `num_samples` and the like of the refits; eq. 8 keeps the full K.
 
     Returns:
-      along `preference`: `pareto_k`; `change_estimated`, the length of the change of the mean utility weights over the
-      prior scale, by importance weights; where `refitted`, and NaN elsewhere: `change`, the same by the refit,
+      along `preference`: `pareto_k`; `change_estimated`, the root mean square change of the margins' means, by
+      importance weights; where `refitted`, and NaN elsewhere: `change`, the same by the refit,
       `probability` of the answer given the others, and `margin_means` (preference, margin), the means of all margins
       without the answer; `converged`, whether the refit converged. Also `margin_mean` (margin), given all answers.
     """
     number = tree["constant_data"].sizes["preference"]
     refits = None if refits is None else checks.whole("refits", refits, 0)
     differences = np.asarray(tree["constant_data"]["differences"])
-    weights = np.asarray(tree["utility_weights_mean"])
-    scale = float(tree.attrs["prior_scale"])
+    margin_mean = np.asarray(tree["posterior"]["margins"]).mean(axis=(0, 1))
     pareto_k, estimated = _estimates(tree)
     chosen = np.argsort(-estimated, kind="stable")[:refits]
     changes, probability = np.full(number, np.nan), np.full(number, np.nan)
@@ -43,27 +43,27 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
     outcome = np.where(tied_rows(tree), TIED, PREFERRED)
     for k in chosen:
         others = refit(tree, np.arange(number) != k, **sampling_options)
-        mean = np.asarray(others["utility_weights_mean"])
-        changes[k] = np.linalg.norm(weights - mean) / scale
-        probability[k] = answer_probabilities(others, differences[[k]])[0, outcome[k]]
-        means[k] = differences @ mean
+        weights = np.asarray(others["utility_weights_mean"])
+        means[k] = np.einsum("ckd,cd->k", settings_of(differences), np.atleast_2d(weights))
+        changes[k] = _length(means[k] - margin_mean)
+        probability[k] = answer_probabilities(others, differences[..., [k], :])[0, outcome[k]]
         converged[k] = bool(others.attrs["converged"])
     return xr.Dataset(
         {
             "pareto_k": ("preference", pareto_k),
-            "change_estimated": ("preference", estimated / scale),
+            "change_estimated": ("preference", estimated),
             "refitted": ("preference", np.isin(np.arange(number), chosen)),
             "change": ("preference", changes),
             "probability": ("preference", probability),
             "converged": ("preference", converged),
             "margin_means": (("preference", "margin"), means),
-            "margin_mean": ("margin", differences @ weights),
+            "margin_mean": ("margin", margin_mean),
         }
     )
 
 
 def plot_influence(result: xr.Dataset, axes: Axes) -> Axes:
-    """Change of the mean utility weights without each answer, with the exact refits, and k̂ where above its limit."""
+    """Change of the margins' means without each answer, with the exact refits, and k̂ where above its limit."""
     numbers = np.arange(result.sizes["preference"])
     axes.plot(numbers, result["change_estimated"], "o", markersize=4, fillstyle="none", label="by importance weights")
     axes.plot(numbers, result["change"], "o", markersize=4, label="by exact refit")
@@ -72,14 +72,14 @@ def plot_influence(result: xr.Dataset, axes: Axes) -> Axes:
         text = f"k̂ {float(result['pareto_k'][k]):.1f}"
         axes.annotate(text, (k, highest[k]), xytext=(3, 3), textcoords="offset points", fontsize=7)
     axes.set(ylim=(0, None), title="Influence")
-    return finished(axes, xlabel="answer left out", ylabel="change of the mean weights / σ")
+    return finished(axes, xlabel="answer left out", ylabel="change of the mean margins")
 
 
 def _estimates(tree: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
-    """k̂ and the length of the change of the mean weights, each shape (K,)."""
-    z = np.asarray(tree["posterior"]["coordinates"])
+    """k̂ and the root mean square change of the margins' means, each shape (K,)."""
+    margins = np.asarray(tree["posterior"]["margins"])
     log_likelihood = np.asarray(tree["log_likelihood"]["answers"])
-    draws = z.reshape(z.shape[0] * z.shape[1], z.shape[2])
+    draws = margins.reshape(-1, margins.shape[2])
     pareto_k, change = np.zeros(log_likelihood.shape[2]), np.zeros(log_likelihood.shape[2])
     for k, column in enumerate(np.moveaxis(log_likelihood, 2, 0)):
         if np.ptp(column) == 0:  # a row of zeros: all weights are equal
@@ -87,5 +87,9 @@ def _estimates(tree: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
         relative = min(1.0, float(array_stats.ess(column[..., None], chain_axis=0, draw_axis=1)[0]) / column.size)
         log_weights, pareto_k[k] = array_stats.psislw(column.ravel(), r_eff=relative)
         weights = np.exp(log_weights - np.max(log_weights))
-        change[k] = np.linalg.norm(weights @ draws / weights.sum() - draws.mean(axis=0))
+        change[k] = _length(weights @ draws / weights.sum() - draws.mean(axis=0))
     return pareto_k, change
+
+
+def _length(change: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(change**2)))

@@ -81,6 +81,8 @@ def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) ->
     if features is None:
         return np.asarray(tree["posterior"]["margins"]), log_prior
     known = np.asarray(tree["constant_data"]["differences"])
+    if known.ndim != 2:
+        raise ValueError("features: expected none for a posterior over several settings of the features")
     features = checks.matrix("features", features, columns=known.shape[1])
     basis = low_rank(known).basis
     inside = features @ basis

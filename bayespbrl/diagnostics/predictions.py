@@ -8,38 +8,71 @@ from dataclasses import fields, replace
 
 import numpy as np
 import xarray as xr
-from scipy.special import ndtr
 
 from bayespbrl import checks
-from bayespbrl.models import PreferenceModel, posterior_draws
-from bayespbrl.models.likelihoods import ProbitMixture
-from bayespbrl.models.low_rank import low_rank
+from bayespbrl.models import Answers, PreferenceModel, posterior_draws
+from bayespbrl.models.likelihoods import likelihood_of, smoothed_probability
 from bayespbrl.models.posterior import SamplerOptions
+from bayespbrl.models.posterior_tree import answers_of, bases_of, settings_of
 
 PREFERRED, DOMINATED, TIED = 0, 1, 2
+MOST_DRAWS = 2000  # a probability is then known to a hundredth
 
 
 def answer_probabilities(tree: xr.DataTree, differences: np.ndarray) -> np.ndarray:
-    """Probability of each possible answer to comparisons that the posterior was not fitted to.
+    """Probability of each possible answer to comparisons that the posterior was not fitted to, without a side bias.
 
     Only the part of a difference in the span of the fitted ones is averaged over draws. The utility of the rest has the
-    prior's normal distribution and is integrated exactly.
+    prior's normal distribution and is integrated exactly. Lapses are those of the first answerer.
 
     Args:
       tree: what `sample_posterior` returned.
-      differences: ψ(one) − ψ(other) of n comparisons, in the units of the fitted differences, shape (n, D).
+      differences: ψ(one) − ψ(other) of n comparisons, in the units of the fitted differences, shape (n, D), or
+        (C, n, D) where the fitted ones have settings.
 
     Returns:
-      shape (n, 3): the one is preferred, the other is preferred, no difference (0 without a tie threshold).
+      shape (n, 3): the one is preferred, the other is preferred, no difference (0 where nothing was tied).
 
     Raises:
       ValueError: differences of another shape or not finite.
     """
-    known = np.asarray(tree["constant_data"]["differences"])
-    differences = checks.matrix("differences", differences, columns=known.shape[1])
-    z = np.asarray(tree["posterior"]["coordinates"])
-    draws = z.reshape(z.shape[0] * z.shape[1], z.shape[2])
-    return _probabilities(draws, low_rank(known).basis, differences, fitted_model(tree), number_of_preferences(tree))
+    fitted = settings_of(np.asarray(tree["constant_data"]["differences"]))
+    asked = settings_of(differences)
+    if asked.shape[0] != fitted.shape[0] or asked.shape[2] != fitted.shape[2]:
+        expected = ("C", "n", fitted.shape[2]) if len(fitted) > 1 else ("n", fitted.shape[2])
+        raise ValueError(f"differences: expected shape {expected}, got {np.shape(differences)}")
+    if "shown_first" in tree["constant_data"]:  # one feature more: the side
+        asked = np.concatenate([asked, np.zeros((*asked.shape[:2], 1))], axis=2)
+    draws, model = _every(tree), fitted_model(tree)
+    probabilities = np.zeros((asked.shape[1], 3))
+    for number, (basis, rows) in enumerate(zip(bases_of(tree), asked, strict=True)):
+        chosen = draws["setting"] == number
+        if not chosen.any():
+            continue
+        inside = rows @ basis
+        margins = draws["coordinates"][chosen][:, : basis.shape[1]] @ inside.T
+        spread = model.prior_scale * np.linalg.norm(rows - inside @ basis.T, axis=1)
+        values = {name: values[chosen][:, None] for name, values in draws.items() if name in PARAMETERS}
+        threshold = values.pop("tie_threshold", np.zeros((1, 1)))
+        likelihood = likelihood_of(model.likelihood, number_of_preferences(tree), **values)
+        for column, side in ((PREFERRED, 1.0), (DOMINATED, -1.0)):
+            probabilities[:, column] += smoothed_probability(likelihood, side * margins - threshold, spread).sum(axis=0)
+    probabilities /= len(draws["setting"])
+    probabilities[:, TIED] = 1 - probabilities[:, :TIED].sum(axis=1) if "tie_threshold" in draws else 0.0
+    return probabilities
+
+
+PARAMETERS = ("steepness", "lapse_rate", "tie_threshold")
+
+
+def _every(tree: xr.DataTree) -> dict[str, np.ndarray]:
+    """Draws of all chains, thinned, along the first axis."""
+    drawn = tree.children["posterior"].dataset
+    apart = -(-drawn["setting"].size // MOST_DRAWS)
+    names = [name for name in ("setting", "coordinates", *PARAMETERS) if name in drawn]
+    parts = {name: drawn[name].values[:, ::apart] for name in names}
+    parts["lapse_rate"] = parts["lapse_rate"][:, :, 0]
+    return {name: part.reshape(-1, *part.shape[2:]) for name, part in parts.items()}
 
 
 def held_out_probabilities(
@@ -48,29 +81,26 @@ def held_out_probabilities(
     used: np.ndarray,
     asked: np.ndarray,
     *,
-    indifferent: np.ndarray | None = None,
+    answers: Answers = Answers(),
     number_of_preferences: int | None = None,
     **sampling_options: int,
 ) -> tuple[np.ndarray, bool]:
     """Fit a model to some rows of `differences` and predict the answers of others.
 
     Args:
-      differences: shape (K, D).
+      differences: shape (K, D) or (C, K, D).
       model: prior and likelihood.
       used, asked: the fitted rows and the n predicted ones: bool (K,), or row numbers.
-      indifferent: rows with the answer "no difference", shape (K,) bool.
+      answers: ties, sides and answerers of the rows.
       number_of_preferences: K of eq. 8; all rows by default.
       sampling_options: `seed`, `num_samples` and the like of `sample_posterior`.
 
     Returns:
       `answer_probabilities` (n, 3) of the asked rows, and whether the sampler converged.
     """
-    known, number = differences[used], len(differences) if number_of_preferences is None else number_of_preferences
-    if len(known) == 0:  # the prior: no draws are needed
-        nothing = np.zeros((1, 0)), np.zeros((differences.shape[1], 0))
-        return _probabilities(*nothing, differences[asked], model, number), True
-    tree = _fit(known, model, None if indifferent is None else indifferent[used], number, **sampling_options)
-    return answer_probabilities(tree, differences[asked]), bool(tree.attrs["converged"])
+    number = differences.shape[-2] if number_of_preferences is None else number_of_preferences
+    tree = _fit(differences[..., used, :], model, answers.of(used), number, **sampling_options)
+    return answer_probabilities(tree, differences[..., asked, :]), bool(tree.attrs["converged"])
 
 
 def refit(tree: xr.DataTree, used: np.ndarray, **sampling_options: int) -> xr.DataTree:
@@ -78,21 +108,20 @@ def refit(tree: xr.DataTree, used: np.ndarray, **sampling_options: int) -> xr.Da
 
     `sampling_options` are `seed`, `num_samples` and the like of `sample_posterior`; the seed is the tree's by default.
     """
-    known = np.asarray(tree["constant_data"]["differences"])[used]
+    known = np.asarray(tree["constant_data"]["differences"])[..., used, :]
     options = {"seed": int(tree.attrs["seed"]), **sampling_options}
-    return _fit(known, fitted_model(tree), tied_rows(tree)[used], number_of_preferences(tree), **options)
+    return _fit(known, fitted_model(tree), answers_of(tree).of(used), number_of_preferences(tree), **options)
 
 
 def fitted_model(tree: xr.DataTree) -> PreferenceModel:
     """The model that a tree's draws are from."""
     options = {field.name: tree.attrs[field.name] for field in fields(PreferenceModel)}
-    no_ties = np.isnan(options["tie_threshold"])
-    return PreferenceModel(**options | ({"tie_threshold": None} if no_ties else {}))
+    return PreferenceModel(**{name: None if x != x else x for name, x in options.items()})  # NaN: inferred
 
 
 def number_of_preferences(tree: xr.DataTree) -> int:
     """K of eq. 8 in a tree's model."""
-    return int(tree.attrs["number_of_preferences"])
+    return max(int(tree.attrs["number_of_preferences"]), 1)
 
 
 def tied_rows(tree: xr.DataTree) -> np.ndarray:
@@ -115,34 +144,8 @@ def answer_groups(groups: np.ndarray | None, number: int) -> np.ndarray:
 
 
 def _fit(
-    known: np.ndarray, model: PreferenceModel, tied: np.ndarray | None, number: int, *, seed: int = 0, **sampler: int
+    known: np.ndarray, model: PreferenceModel, answers: Answers, number: int, *, seed: int = 0, **sampler: int
 ) -> xr.DataTree:
-    tied = None if model.tie_threshold is None else tied
-    options = SamplerOptions(**sampler)
-    return posterior_draws(known, model, seed=seed, indifferent=tied, number_of_preferences=number, sampler=options)
-
-
-def _probabilities(
-    coordinates: np.ndarray, basis: np.ndarray, differences: np.ndarray, model: PreferenceModel, number: int
-) -> np.ndarray:
-    mixture = replace(model, tie_threshold=None).answer_likelihood(number).probit_mixture()
-    inside = differences @ basis
-    # the margin given z is normal: mean z·inside, and the prior's spread in the directions outside the basis
-    spread = model.prior_scale * np.linalg.norm(differences - inside @ basis.T, axis=1)
-    shift = 0.0 if model.tie_threshold is None else model.tie_threshold
-    probabilities = np.empty((len(differences), 3))
-    for k, (row, sd) in enumerate(zip(inside, spread, strict=True)):
-        margins = coordinates @ row
-        probabilities[k, PREFERRED] = np.mean(_smoothed(mixture, margins - shift, sd))
-        probabilities[k, DOMINATED] = np.mean(_smoothed(mixture, -margins - shift, sd))
-    probabilities[:, TIED] = 0.0 if model.tie_threshold is None else 1 - probabilities[:, :TIED].sum(axis=1)
-    return probabilities
-
-
-def _smoothed(mixture: ProbitMixture, margins: np.ndarray, sd: float) -> np.ndarray:
-    """E p(t) over t ~ N(margins, sd²): each probit of the mixture stays one, with scale √(h² + sd²)."""
-    total = np.full(margins.shape, float(mixture.constant))
-    for weight, offset, scale in zip(mixture.weights, mixture.offsets, mixture.scales, strict=True):
-        width = np.hypot(scale, sd)
-        total += weight * (ndtr((margins - offset) / width) if width > 0 else (1 + np.sign(margins - offset)) / 2)
-    return total
+    return posterior_draws(
+        known, model, seed=seed, answers=answers, number_of_preferences=number, sampler=SamplerOptions(**sampler)
+    )

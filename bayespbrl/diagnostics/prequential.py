@@ -11,7 +11,8 @@ from scipy.special import xlog1py, xlogy
 
 from bayespbrl import checks
 from bayespbrl.diagnostics import predictions
-from bayespbrl.models import PreferenceModel
+from bayespbrl.models import Answers, PreferenceModel
+from bayespbrl.models.posterior_tree import answers_of, settings_of
 
 
 def prequential_predictions(
@@ -20,7 +21,7 @@ def prequential_predictions(
     model: PreferenceModel | None = None,
     *,
     groups: np.ndarray | None = None,
-    indifferent: np.ndarray | None = None,
+    answers: Answers = Answers(),
     **sampling_options: int,
 ) -> np.ndarray:
     """Probability that the first shown is preferred, for each answer by an exact refit to the answers before it.
@@ -29,30 +30,28 @@ def prequential_predictions(
     likelihood.
 
     Args:
-      differences: ψ(preferred) − ψ(dominated) in the order of the answers, shape (K, D).
+      differences: ψ(preferred) − ψ(dominated) in the order of the answers, shape (K, D) or (C, K, D).
       first_preferred: whether the preferred one was shown first, shape (K,) bool.
       model: prior and likelihood; the defaults of `PreferenceModel` when None.
       groups: the number of the answer that each row follows from, never decreasing, shape (K,): no row is used to
         predict another of its answer. Every row is an answer of its own by default.
-      indifferent: rows with the answer "no difference", shape (K,) bool. The prediction is conditional on a preference
-        being stated.
+      answers: ties, sides and answerers of the rows. The prediction is conditional on a preference being stated.
       sampling_options: `seed`, `num_samples` and the like of `sample_posterior`; `number_of_preferences`, another K.
 
     Returns:
       shape (K,).
     """
-    differences = checks.matrix("differences", differences)
-    number = len(differences)
+    differences = np.asarray(differences, dtype=np.float64)
+    number = settings_of(differences).shape[1]
     first_preferred = checks.flags("first_preferred", first_preferred, number)
     groups = predictions.answer_groups(groups, number)
-    if indifferent is not None:
-        indifferent = checks.flags("indifferent", indifferent, number)
+    answers = answers.checked(number)
     model = PreferenceModel() if model is None else model
     predicted = np.empty(number)
     for group in np.unique(groups):
         asked = groups == group
         probabilities, _ = predictions.held_out_probabilities(
-            differences, model, groups < group, asked, indifferent=indifferent, **sampling_options
+            differences, model, groups < group, asked, answers=answers, **sampling_options
         )
         stated = probabilities[:, predictions.PREFERRED] + probabilities[:, predictions.DOMINATED]
         column = np.where(first_preferred[asked], predictions.PREFERRED, predictions.DOMINATED)
@@ -86,7 +85,7 @@ def calibration(
       what `score_predictions` returns; answers "no difference" are not scored.
     """
     differences = np.asarray(tree["constant_data"]["differences"])
-    number, tied = len(differences), predictions.tied_rows(tree)
+    number, tied = differences.shape[-2], predictions.tied_rows(tree)
     order = "drawn" if first_preferred is None else "given"
     if first_preferred is None:
         first_preferred = np.random.default_rng(seed).random(number) < 0.5
@@ -96,7 +95,7 @@ def calibration(
         options = {"seed": int(tree.attrs["seed"]), "number_of_preferences": predictions.number_of_preferences(tree)}
         options |= sampling_options
         predicted = prequential_predictions(
-            differences, first_preferred, predictions.fitted_model(tree), groups=groups, indifferent=tied, **options
+            differences, first_preferred, predictions.fitted_model(tree), groups=groups, answers=answers_of(tree), **options
         )
     predicted = np.asarray(predicted, dtype=np.float64)
     if predicted.shape != (number,):

@@ -1,13 +1,11 @@
 """Posterior draws of returns of trajectories, their ranking, Q and the greedy action (steps 1 and 2).
 
-All of these are linear in the weights. The return of a trajectory is wᵀψ(τ). LSTD is linear in the utilities, so that
-Q(s, a) = wᵀψ(s, a) with the successor features ψ(s, a), which one solution gives for every draw of w.
+The return of a trajectory is wᵀψ(τ). LSTD is linear in the utilities, so that one solution gives Q for every draw.
 
 Results are in units of the utility, which the answers fix only up to a positive factor.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import jax
 import numpy as np
@@ -19,8 +17,8 @@ from scipy.stats import rankdata
 
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
-from bayespbrl.diagnostics.estimates import expect_sampled, is_average
-from bayespbrl.improvement.q_function import QFunction, estimate_q
+from bayespbrl.diagnostics.estimates import expect_posterior
+from bayespbrl.improvement.q_function import estimate_q
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Trajectory, transitions
 from bayespbrl.utility import PosteriorUtility, UtilityEstimate
@@ -33,7 +31,7 @@ INTERVALS = ((0.25, 0.75, 4.0), (0.05, 0.95, 1.2))
 def return_draws(
     estimate: UtilityEstimate | None, trajectories: Sequence[Trajectory], *, number: int = 1000
 ) -> xr.Dataset:
-    """Posterior draws of the utility wᵀψ(τ) of each trajectory; those of an average are one chain.
+    """Posterior draws of the utility wᵀψ(τ) of each trajectory.
 
     Args:
       estimate: one with a posterior.
@@ -46,10 +44,9 @@ def return_draws(
     Raises:
       ValueError: an estimate without a posterior; no trajectories; a number < 1.
     """
-    fit = expect_sampled(estimate)
-    drawn = estimate if is_average(estimate) else fit
-    draws = drawn.trajectory_draws(trajectories, number=number)
-    chains = 1 if is_average(estimate) else fit.posterior["posterior"].sizes["chain"]
+    fit = expect_posterior(estimate)
+    draws = fit.trajectory_draws(trajectories, number=number)
+    chains = fit.posterior["posterior"].sizes["chain"]
     return xr.Dataset(
         {"returns": (("chain", "draw", "trajectory"), draws.reshape(chains, -1, len(trajectories)))},
         {"trajectory": np.arange(len(trajectories))},
@@ -93,30 +90,37 @@ def ranking_probabilities(returns: xr.Dataset) -> xr.Dataset:
     )
 
 
-def successor_features(learner: Learner, *, seed: int = 0) -> QFunction:
-    """ψ(s, a): the discounted sum of φ that follows action a in s under the learner's policy, for Q(s, a) = wᵀψ(s, a).
+def q_draws(
+    learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: int = 200, seed: int = 0
+) -> xr.Dataset:
+    """Posterior draws of Q(s, a) under the learner's policy, for each pair of the given states and actions.
 
-    LSTD-Q with each feature of the next state as a utility, from all transitions of the learner. The state-action
+    LSTD-Q once, with the utility of each draw as a column, from all transitions of the learner. The state-action
     features are drawn as the learner draws them.
 
     Args:
       learner: after at least one iteration; `run.learner` for a run read from disk.
+      states: n of them, shape (n, S), or (n,) where discrete.
+      actions: m to choose from, shape (m, A), or (m,) where discrete.
+      number: cap on the draws, which are evenly spaced over the chains.
       seed: of the state-action features and of fresh continuous actions.
 
     Returns:
-      a `QFunction` whose value is (N, D) at N states and actions.
+      `q` (chain, draw, state, action), with the actions as a coordinate where they are numbers, and the attributes of
+      `return_draws`.
 
     Raises:
-      ValueError: a learner without an estimate that has a posterior.
-
-    Source: Dayan (1993), "Improving generalization for temporal difference learning: the successor representation".
+      ValueError: a learner without an estimate that has a posterior; no states or no actions.
     """
-    features = expect_sampled(learner.estimate).features
+    fit, states, actions = expect_posterior(learner.estimate), np.asarray(states), np.asarray(actions)
+    if states.ndim == 0 or actions.ndim == 0 or not (len(states) and len(actions)):
+        raise ValueError(f"states, actions: expected at least one row each, got {states.shape} and {actions.shape}")
     steps = transitions(learner.trajectories)
-    return estimate_q(
+    _, draws = fit.utilities_and_draws(steps.next_states, number=number)
+    q = estimate_q(
         learner.policy,
         steps,
-        features(steps.next_states),
+        draws.T,
         key=jax.random.key(seed),
         action_space=learner.environment.action_space,
         features=learner.feature_source.of_steps(
@@ -124,40 +128,11 @@ def successor_features(learner: Learner, *, seed: int = 0) -> QFunction:
         ),
         critic=learner.settings.critic,
     )
-
-
-def q_draws(
-    estimate: UtilityEstimate | None,
-    successors: QFunction,
-    states: ArrayLike,
-    actions: ArrayLike,
-    *,
-    number: int = 1000,
-) -> xr.Dataset:
-    """Posterior draws of Q(s, a) for each pair of the given states and actions.
-
-    Args:
-      estimate: one with a posterior, of the same features as `successors`.
-      successors: what `successor_features` returned.
-      states: n of them, shape (n, S), or (n,) where discrete.
-      actions: m to choose from, shape (m, A), or (m,) where discrete.
-      number: cap on the draws, which are evenly spaced over the chains.
-
-    Returns:
-      `q` (chain, draw, state, action), with the actions as a coordinate where they are numbers, and the attributes of
-      `return_draws`. For an average over settings the draws are those of its one sampled setting.
-
-    Raises:
-      ValueError: an estimate without a posterior; no states or no actions.
-    """
-    fit, states, actions = expect_sampled(estimate), np.asarray(states), np.asarray(actions)
-    if states.ndim == 0 or actions.ndim == 0 or not (len(states) and len(actions)):
-        raise ValueError(f"states, actions: expected at least one row each, got {states.shape} and {actions.shape}")
-    rows = successors(np.repeat(states, len(actions), axis=0), np.concatenate([actions] * len(states)))
-    draws = fit.draws(rows, number=number)
+    rows = q(np.repeat(states, len(actions), axis=0), np.concatenate([actions] * len(states)))
+    shape = (fit.posterior["posterior"].sizes["chain"], -1, len(states), len(actions))
     labels = actions.reshape(len(actions), -1)
     return xr.Dataset(
-        {"q": (("chain", "draw", "state", "action"), draws.reshape(*draws.shape[:2], len(states), len(actions)))},
+        {"q": (("chain", "draw", "state", "action"), rows.T.reshape(shape))},
         {"state": np.arange(len(states)), "action": labels[:, 0] if labels.shape[1] == 1 else np.arange(len(actions))},
         _convergence(fit),
     )
@@ -257,15 +232,14 @@ def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
     return finished(axes, whole=False, xlabel="action", ylabel="state", title=_titled("Best action", greedy))
 
 
-def thinned(estimate: PosteriorUtility, number: int) -> PosteriorUtility:
-    """The estimate with at most `number` draws, evenly spaced over the chains, and at least one a chain.
+def thinned(tree: xr.DataTree, number: int) -> xr.DataTree:
+    """A posterior with at most `number` draws, evenly spaced over the chains, and at least one a chain.
 
     Raises:
       ValueError: a number < 1.
     """
-    sizes = estimate.posterior.children["posterior"].sizes
-    apart = spacing(sizes["chain"] * sizes["draw"], number)
-    return replace(estimate, posterior=estimate.posterior.isel(draw=slice(None, None, apart)))
+    sizes = tree.children["posterior"].sizes
+    return tree.isel(draw=slice(None, None, spacing(sizes["chain"] * sizes["draw"], number)))
 
 
 def _convergence(fit: PosteriorUtility) -> dict[str, float]:

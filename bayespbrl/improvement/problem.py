@@ -97,7 +97,7 @@ def step_utilities(
     utility: UtilityEstimate, steps: Transitions, *, draws: int
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n s"] | None]:
     """uᵢ of each transition, and under S posterior draws: at most `draws`, None where there are none."""
-    if not draws or utility.sampled is None:
+    if not draws or utility.posterior is None:
         return utility.step_utilities(steps), None
     utilities, drawn = utility.utilities_and_draws(steps.next_states, number=draws)
     return utilities, drawn.T

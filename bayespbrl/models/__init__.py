@@ -1,30 +1,31 @@
 """Densities and how to sample them.
 
 preference_model         σ, m, λ, likelihood and ties in one object; eqs. 7-8 in NumPyro
+priors                   of what is inferred beside the weights
 likelihoods              the probability of an answer given a margin: eq. 8, lapses, Bradley-Terry, probit, ties
 elliptical_slice         the kernel's textbook algorithm; elliptical_slice_kernel is the kernel for NumPyro
 low_rank                 the part of the utility that the answers determine
 expectation_propagation  a Gaussian close to the posterior, and the marginal likelihood
 gaussian_fit             both of these for given answers
-preference_problem       the model in low rank, and the ellipses that sample it fast; chains runs them
+preference_problem       the model in low rank given all else, and the ellipses that sample it fast
+gibbs                    moves over all else: length scales, steepness, lapse rates, tie threshold; chains runs both
+evidence                 the marginal likelihood, by bridge sampling
 posterior                draws until the chains have converged; posterior_tree has them in ArviZ's schema
 convergence              R̂, effective sample size and Monte Carlo error
-hyperparameters          length scales, prior scale and steepness by marginal likelihood
 linear_program           eq. 10, the alternative to the posterior
 """
 
 from bayespbrl.models.elliptical_slice_kernel import EllipticalSlice
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian
-from bayespbrl.models.hyperparameters import HyperparameterSearch, search_hyperparameters
 from bayespbrl.models.linear_program import LinearProgramResult, linear_program
 from bayespbrl.models.posterior import posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import restored, stored
-from bayespbrl.models.preference_model import PreferenceModel, preference_model
+from bayespbrl.models.preference_model import Answers, PreferenceModel, preference_model
 
 __all__ = [
+    "Answers",
     "EllipticalSlice",
     "GaussianFit",
-    "HyperparameterSearch",
     "LinearProgramResult",
     "PreferenceModel",
     "fit_gaussian",
@@ -33,6 +34,5 @@ __all__ = [
     "preference_model",
     "restored",
     "sample_posterior",
-    "search_hyperparameters",
     "stored",
 ]

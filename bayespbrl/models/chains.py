@@ -1,18 +1,21 @@
-"""Chains of elliptical slice sampling on a preference problem, by one compiled sampler for each capacity."""
+"""Chains on everything that is unknown, by one compiled sampler for each capacity: Gibbs moves, and elliptical slices."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
-from jaxtyping import Float, Shaped
+from jax import Array, lax, random
+from jaxtyping import Float, Int, Shaped
+from scipy.special import softmax
 
 from bayespbrl.models.elliptical_slice import Ellipse
 from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords, Values
 from bayespbrl.models.gaussian_fit import GaussianFit
-from bayespbrl.models.likelihoods import log_prob, total_log_prob
+from bayespbrl.models.gibbs import JointProblem, Table, Unknowns, conditional, moved, stacked
+from bayespbrl.models.likelihoods import WithTies, log_prob, total_log_prob
 from bayespbrl.models.low_rank import used_rows
 from bayespbrl.models.preference_problem import (
     PreferenceProblem,
@@ -21,13 +24,15 @@ from bayespbrl.models.preference_problem import (
     prior_ellipse,
     reference_ellipse,
 )
+from bayespbrl.models.priors import Grid, given
 
 # Share of each answer's Gaussian factor that enters the reference: with all of it the reference is as narrow as the
 # posterior's bulk and its residual has no bound in the tails; with none of it the reference is the prior, which mixes
 # badly.
 REFERENCE_POWER = 0.5
 # Moves around the reference's and the prior's ellipses per recorded draw; those around the prior's help in the tails.
-REFERENCE_MOVES, PRIOR_MOVES = 26, 6
+# They are made in so many sweeps, where more than the weights is unknown: lapse rate and weights move in turn.
+REFERENCE_MOVES, PRIOR_MOVES, SWEEPS = 26, 6, 6
 # Draws that one call of the compiled sampler makes; its length is part of what is compiled.
 CHUNK = 25
 
@@ -38,40 +43,60 @@ class Chains:
 
     Attributes:
       problem: what they sample.
-      state: of all chains after their last draw.
+      state, unknowns: of all chains after their last draw.
       chunk: draws per call of the compiled sampler.
       rank, number: r and K, without the padding.
       draws: the chunks so far.
     """
 
-    problem: PreferenceProblem
+    problem: JointProblem
     state: EllipticalSliceState
+    unknowns: Unknowns
     chunk: int
     rank: int
     number: int
     draws: tuple[dict[str, Shaped[np.ndarray, "chain draw ..."]], ...] = ()
 
     @classmethod
-    def start(cls, fit: GaussianFit, *, num_chains: int, chunk: int, seed: int) -> "Chains":
-        """Chains that start at draws of the reference."""
-        loadings, approximation = fit.factors.loadings, fit.approximation
-        site_precisions = np.zeros(len(loadings))
-        site_precisions[used_rows(loadings)] = REFERENCE_POWER * approximation.site_precisions
-        problem = padded_problem(
-            loadings,
-            fit.likelihood,
-            prior_scale=fit.model.prior_scale,
-            mean=approximation.mean,
-            site_precisions=site_precisions,
+    def start(
+        cls,
+        fits: Sequence[GaussianFit],
+        *,
+        num_chains: int,
+        chunk: int,
+        seed: int,
+        answerers: Int[np.ndarray, " k"] | None = None,
+    ) -> "Chains":
+        """Chains that start far apart: at draws of the reference, of the unknowns' priors, and of the settings.
+
+        Args:
+          fits: one for each setting, equally probable a priori.
+          num_chains, chunk, seed: numbers of chains and of draws a call; of all draws.
+          answerers: who gave each answer, 0 to A − 1; None: one for all.
+        """
+        problem, rank = joint_problem(fits, answerers), max(fit.factors.loadings.shape[1] for fit in fits)
+        rng = np.random.default_rng(seed)
+        # likely settings, but spread wider than the posterior over them: chains that agree have forgotten their start
+        setting = rng.choice(len(fits), num_chains, p=softmax([0.5 * fit.log_evidence for fit in fits]))
+
+        def drawn(prior: Table, *shape: int) -> Int[Array, "..."]:
+            probabilities = np.exp(np.asarray(prior.log_probabilities))
+            return jnp.asarray(rng.choice(len(prior.values), (num_chains, *shape), p=probabilities / probabilities.sum()))
+
+        unknowns = Unknowns(
+            jnp.asarray(setting),
+            drawn(problem.steepness),
+            drawn(problem.lapse_rate, len(problem.answerers)),
+            drawn(problem.tie_threshold),
         )
-        # the reference is wider than the posterior's bulk: chains that agree have forgotten their start
-        noise = np.random.default_rng(seed).standard_normal((num_chains, len(problem.centre)))
-        start = np.asarray(problem.centre) + noise @ np.asarray(problem.root).T
+        one = jax.vmap(conditional, (None, 0))(problem, unknowns)
+        noise = jnp.asarray(rng.standard_normal(one.centre.shape))
+        start = one.centre + jnp.einsum("cij,cj->ci", one.root, noise)
         zeros = jnp.zeros(num_chains)
-        keys = jax.random.split(jax.random.key(seed), num_chains)
         no = zeros.astype(bool)
-        state = EllipticalSliceState({"utility_weights": jnp.asarray(start)}, zeros, zeros, no, no, keys)
-        return cls(problem, state, chunk, loadings.shape[1], len(loadings))
+        keys = jax.random.split(jax.random.key(seed), num_chains)
+        state = EllipticalSliceState({"utility_weights": start}, zeros, zeros, no, no, keys)
+        return cls(problem, state, unknowns, chunk, rank, len(fits[0].differences))
 
     @property
     def length(self) -> int:
@@ -80,22 +105,66 @@ class Chains:
 
     def extended(self, more: int) -> "Chains":
         """At least `more` draws longer."""
-        draws, state = list(self.draws), self.state
+        draws, state, unknowns = list(self.draws), self.state, self.unknowns
         for _ in range(-(-more // self.chunk)):
-            state, states, answers = draw_chunk(state, self.problem, length=self.chunk)
+            (state, unknowns), (states, them, answers) = draw_chunk(state, unknowns, self.problem, length=self.chunk)
             z, log_p = np.asarray(states.z["utility_weights"]), np.asarray(answers)
             flags = {name: np.asarray(getattr(states, name)) for name in ("candidates", "stuck", "diverging")}
-            draws.append({"coordinates": z[:, :, : self.rank], "answers": log_p[:, :, : self.number], **flags})
-        return replace(self, state=state, draws=tuple(draws))
+            part = {"coordinates": z[:, :, : self.rank], "answers": log_p[:, :, : self.number], **flags}
+            draws.append(part | {name: np.asarray(value) for name, value in them._asdict().items()})
+        return replace(self, state=state, unknowns=unknowns, draws=tuple(draws))
 
     def collected(self, name: str, length: int) -> Shaped[np.ndarray, "chain {length} ..."]:
         """The first `length` draws of what is called `name`."""
         return np.concatenate([part[name] for part in self.draws], axis=1)[:, :length]
 
+    def values(self, name: str, length: int) -> Shaped[np.ndarray, "chain {length} ..."]:
+        """The first `length` draws of `steepness`, `lapse_rate` or `tie_threshold`, as values."""
+        return np.asarray(getattr(self.problem, name).values)[self.collected(name, length)]
 
-def _ellipses(model_args: Args, model_kwargs: Keywords) -> list[tuple[Ellipse, int]]:
+
+def joint_problem(fits: Sequence[GaussianFit], answerers: Int[np.ndarray, " k"] | None = None) -> JointProblem:
+    """The problem of all settings, with the references of their fits."""
+    model, likelihood = fits[0].model, fits[0].likelihood
+    rank = max(fit.factors.loadings.shape[1] for fit in fits)
+    problems = [_with_reference(fit, rank) for fit in fits]
+    numbers = np.zeros(len(fits[0].differences), dtype=int) if answerers is None else answerers
+    one_hot = np.zeros((max(numbers, default=0) + 1, problems[0].loadings.shape[0]))
+    one_hot[numbers, np.arange(len(numbers))] = 1.0
+
+    def table(prior: Grid) -> Table:
+        return Table(jnp.asarray(prior.values), jnp.log(jnp.asarray(prior.probabilities)))
+
+    return JointProblem(
+        stacked(problems),
+        jnp.full(len(fits), -np.log(len(fits))),
+        table(model.steepness_prior),
+        table(model.lapse_rate_prior),
+        table(model.tie_threshold_prior if isinstance(likelihood, WithTies) else given(0.0)),
+        jnp.asarray(one_hot),
+    )
+
+
+def _with_reference(fit: GaussianFit, rank: int) -> PreferenceProblem:
+    """The problem of one setting, with the reference of its fit."""
+    loadings, site_precisions = fit.factors.loadings, np.zeros(len(fit.differences))
+    site_precisions[used_rows(loadings)] = REFERENCE_POWER * fit.approximation.site_precisions
+    return padded_problem(
+        loadings,
+        fit.likelihood,
+        prior_scale=fit.model.prior_scale,
+        mean=fit.approximation.mean,
+        site_precisions=site_precisions,
+        rank_at_least=rank,
+    )
+
+
+def _ellipses(model_args: Args, model_kwargs: Keywords, *, sweeps: int = 1) -> list[tuple[Ellipse, int]]:
     (problem,) = model_args
-    return [(reference_ellipse(problem), REFERENCE_MOVES), (prior_ellipse(problem), PRIOR_MOVES)]
+    return [
+        (reference_ellipse(problem), -(-REFERENCE_MOVES // sweeps)),
+        (prior_ellipse(problem), -(-PRIOR_MOVES // sweeps)),
+    ]
 
 
 def _log_likelihood(z: Values, model_args: Args, model_kwargs: Keywords) -> Float[Array, ""]:
@@ -104,21 +173,52 @@ def _log_likelihood(z: Values, model_args: Args, model_kwargs: Keywords) -> Floa
 
 
 # numpyro.infer.MCMC would compile this kernel anew on every run; `draw_chunk` compiles once for each capacity.
-KERNEL = EllipticalSlice(low_rank_model, batch=8, ellipses=_ellipses, log_likelihood=_log_likelihood)
+KERNEL, KERNEL_OF_SWEEP = (
+    EllipticalSlice(
+        low_rank_model, batch=8, ellipses=partial(_ellipses, sweeps=sweeps), log_likelihood=_log_likelihood
+    )
+    for sweeps in (1, SWEEPS)
+)
+Recorded = tuple[EllipticalSliceState, Unknowns, Float[Array, "*draws k"]]
+
+
+def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem) -> Recorded:
+    """One draw of one chain, and log p of each answer there."""
+    unknown = any(len(prior) > 1 for prior in (problem.log_probabilities, *(table.values for table in problem[2:5])))
+    kernel, sweeps = (KERNEL_OF_SWEEP, SWEEPS) if unknown else (KERNEL, 1)
+
+    def sweep(
+        last: tuple[EllipticalSliceState, Unknowns], _: None
+    ) -> tuple[tuple[EllipticalSliceState, Unknowns], tuple[Array, Array]]:
+        state, unknowns = last
+        key, sub = random.split(state.rng_key)
+        z, unknowns = moved(sub, state.z["utility_weights"], unknowns, problem)
+        state = state._replace(z={"utility_weights": z}, rng_key=key)
+        state = kernel.sample(state, (conditional(problem, unknowns),), {})
+        return (state, unknowns), (state.candidates, state.stuck)
+
+    (state, unknowns), (candidates, stuck) = lax.scan(sweep, (state, unknowns), None, length=sweeps)
+    state = state._replace(candidates=jnp.mean(candidates), stuck=jnp.any(stuck))
+    one = conditional(problem, unknowns)
+    return state, unknowns, log_prob(one.likelihood, one.loadings @ state.z["utility_weights"])
 
 
 # Level 1 compiles faster, and a loop over small vectors runs as fast.
 @partial(jax.jit, static_argnames="length", compiler_options={"xla_backend_optimization_level": 1})
 def draw_chunk(
-    state: EllipticalSliceState, problem: PreferenceProblem, *, length: int
-) -> tuple[EllipticalSliceState, EllipticalSliceState, Float[Array, "chain draw k"]]:
-    """`length` draws of all chains: the last state, all states (chain, draw, ...), and log p of each answer at each."""
+    state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem, *, length: int
+) -> tuple[tuple[EllipticalSliceState, Unknowns], Recorded]:
+    """`length` draws of all chains: the last, and all (chain, draw, ...) with log p of each answer at each."""
 
-    def draw(state: EllipticalSliceState, _: None) -> tuple[EllipticalSliceState, EllipticalSliceState]:
-        state = KERNEL.sample(state, (problem,), {})
-        return state, state._replace(rng_key=jnp.zeros(()))
+    def chain(
+        state: EllipticalSliceState, unknowns: Unknowns
+    ) -> tuple[tuple[EllipticalSliceState, Unknowns], Recorded]:
+        def step(
+            last: tuple[EllipticalSliceState, Unknowns], _: None
+        ) -> tuple[tuple[EllipticalSliceState, Unknowns], Recorded]:
+            state, unknowns, answers = draw(*last, problem)
+            return (state, unknowns), (state._replace(rng_key=jnp.zeros(())), unknowns, answers)
 
-    last, states = lax.scan(draw, state, None, length=length)
-    states = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1) if x.ndim > 1 else x, states)
-    answers = log_prob(problem.likelihood, states.z["utility_weights"] @ problem.loadings.T)
-    return last, states, answers
+        return lax.scan(step, (state, unknowns), None, length=length)
+
+    return jax.vmap(chain)(state, unknowns)

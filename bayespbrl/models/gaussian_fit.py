@@ -48,15 +48,13 @@ def fit_gaussian(
 
     Args:
       differences, indifferent, number_of_preferences: as of `sample_posterior`.
-      model: prior and likelihood.
+      model: prior and likelihood; what it infers is at its prior's mean.
     """
     differences = checks.matrix("differences", differences)
     number, dimension = differences.shape
     if dimension == 0:
         raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
-    tied = np.zeros(number, dtype=bool) if indifferent is None else np.asarray(indifferent)
-    if tied.shape != (number,) or tied.dtype != bool:
-        raise ValueError(f"indifferent: expected bool of shape ({number},), got {tied.dtype} of shape {tied.shape}")
+    tied = np.zeros(number, dtype=bool) if indifferent is None else checks.flags("indifferent", indifferent, number)
     likelihood = model.answer_likelihood(number if number_of_preferences is None else number_of_preferences, tied)
     with one_blas_thread():
         factors = low_rank(differences)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
+from scipy.special import ndtr
 
 LIKELIHOODS = ("mixed", "logistic", "probit")  # names of those that have neither lapses nor ties
 Scalar = float | Float[Array, ""]  # a number, or what JAX makes of it where it traces a function
@@ -226,6 +227,61 @@ class WithTies:
             np.concatenate([offsets + self.threshold, offsets - self.threshold]),
             np.concatenate([scales, scales]),
         )
+
+
+def likelihood_of(
+    name: str,
+    number_of_preferences: float,
+    *,
+    steepness: Scalar | Values,
+    lapse_rate: Scalar | Values | None = None,
+    tie_threshold: Scalar | Values | None = None,
+    indifferent: Bool[Array, " k"] | Bool[np.ndarray, " k"] | bool = False,
+) -> Likelihood:
+    """The likelihood `name` with these values: numbers, or arrays that broadcast against the margins.
+
+    Args:
+      name: one of `LIKELIHOODS`.
+      number_of_preferences: K of eq. 8.
+      steepness: m.
+      lapse_rate: λ; None for no lapses.
+      tie_threshold: δ; None for no ties.
+      indifferent: which answers were "no difference".
+    """
+    ordered: Mixed | Logistic | Probit | WithLapses
+    if name == "mixed":
+        ordered = Mixed(steepness, number_of_preferences)
+    else:
+        ordered = (Logistic if name == "logistic" else Probit)(steepness)
+    if lapse_rate is not None:
+        ordered = WithLapses(ordered, lapse_rate)
+    return ordered if tie_threshold is None else WithTies(ordered, tie_threshold, indifferent)
+
+
+def smoothed_probability(
+    likelihood: Likelihood, margins: Float[np.ndarray, "*b k"], spread: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "*b k"]:
+    """E p(t) over t ~ N(margin, spread²), exactly: each probit of the mixture stays one; for an ordered answer."""
+    if isinstance(likelihood, WithLapses):
+        lapses = np.asarray(likelihood.lapse_rate)
+        return np.asarray(lapses / 2 + (1 - lapses) * smoothed_probability(likelihood.attentive, margins, spread))
+    if isinstance(likelihood, Mixed):
+        share = 1 / np.asarray(likelihood.number_of_preferences)
+        smooth = smoothed_probability(Logistic(likelihood.steepness), margins, spread)
+        return np.asarray((1 - share) * _widened(margins, np.zeros(1), spread) + share * smooth)
+    assert isinstance(likelihood, Logistic | Probit)
+    weights, scales = _logistic_mixture() if isinstance(likelihood, Logistic) else (np.ones(1), np.ones(1))
+    parts = zip(weights, scales, strict=True)
+    return np.asarray(sum(w * _widened(margins, h / np.asarray(likelihood.steepness), spread) for w, h in parts))
+
+
+def _widened(
+    margins: Float[np.ndarray, "*b k"], scale: Float[np.ndarray, "..."], spread: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "*b k"]:
+    """Φ(t / √(h² + spread²)), a step where both are zero."""
+    width = np.broadcast_to(np.hypot(scale, spread), margins.shape)
+    step = (1 + np.sign(margins)) / 2
+    return np.where(width > 0, ndtr(margins / np.where(width > 0, width, 1.0)), step)
 
 
 def _mixture(weights: Float[np.ndarray, " j"], scales: Float[np.ndarray, " j"]) -> ProbitMixture:

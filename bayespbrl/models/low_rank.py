@@ -4,11 +4,12 @@ The likelihood depends on w only through the margins t = Ψ w = L z with z = Q�
 orthogonal to Q keeps its prior: its draws are exact prior noise and its posterior mean is exactly zero.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -19,7 +20,8 @@ class LowRank:
 
     Attributes:
       loadings: L. Rows of zero differences are exactly zero.
-      basis: Q with orthonormal columns.
+      basis: Q with orthonormal columns, such that L is lower triangular as far as its rank allows: coordinate k is what
+        answer k says that no answer before it did. So coordinates mean alike under different features.
     """
 
     loadings: Float[np.ndarray, "k r"]
@@ -42,9 +44,11 @@ def low_rank(differences: Float[np.ndarray, "k d"]) -> LowRank:
     directions, triangle = np.linalg.qr((differences[used] / lengths[used, None]).T)
     left, values, right = np.linalg.svd(triangle.T)
     rank = int(np.sum(values > values[0] * max(differences.shape) * np.finfo(float).eps))
+    rotation, triangle = np.linalg.qr((left[:, :rank] * values[:rank]).T)
+    rotation *= np.where(np.diag(triangle) < 0, -1.0, 1.0)
     loadings = np.zeros((len(differences), rank))
-    loadings[used] = lengths[used, None] * left[:, :rank] * values[:rank]
-    return LowRank(loadings, directions @ right[:rank].T)
+    loadings[used] = lengths[used, None] * (left[:, :rank] * values[:rank] @ rotation)
+    return LowRank(loadings, directions @ right[:rank].T @ rotation)
 
 
 def used_rows(loadings: Float[np.ndarray, "k r"]) -> Bool[np.ndarray, " k"]:
@@ -53,7 +57,9 @@ def used_rows(loadings: Float[np.ndarray, "k r"]) -> Bool[np.ndarray, " k"]:
 
 
 class UtilityWeights(BackendArray):
-    """Draws of w = Q z + σ (I − QQᵀ) ε, of shape (chain, draw, feature), computed where they are indexed.
+    """Draws of w = Q z + σ (I − QQᵀ) ε, of shape (chain, draw, feature), with the Q of each draw's setting.
+
+    They are computed where they are indexed.
 
     ε comes from a counter-based generator keyed by the seed, the chain and the draw, so that a draw is the same array
     however it is indexed.
@@ -62,14 +68,15 @@ class UtilityWeights(BackendArray):
     def __init__(
         self,
         coordinates: Float[np.ndarray, "chain draw r"],
-        basis: Float[np.ndarray, "d r"],
+        bases: Sequence[Float[np.ndarray, "d _"]],
+        settings: Int[np.ndarray, "chain draw"],
         *,
         prior_scale: float,
         seed: int,
     ) -> None:
-        self.coordinates, self.basis = coordinates, basis
+        self.coordinates, self.bases, self.settings = coordinates, bases, settings
         self.prior_scale, self.seed = prior_scale, seed
-        self.shape = (*coordinates.shape[:2], len(basis))
+        self.shape = (*coordinates.shape[:2], len(bases[0]))
         self.dtype = np.dtype(np.float64)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Float[np.ndarray, "..."] | np.float64:
@@ -89,9 +96,10 @@ class UtilityWeights(BackendArray):
 
     def draw(self, chain: int, draw: int) -> Float[np.ndarray, " d"]:
         """One draw of w."""
+        basis = self.bases[self.settings[chain, draw]]
         generator = np.random.Generator(np.random.Philox(key=self.seed, counter=[0, 0, chain, draw]))
         noise = self.prior_scale * generator.standard_normal(self.shape[2])
         # twice: one projection leaves a rounding error of the size of the margins' smallest directions
         for _ in range(2):
-            noise -= self.basis @ (self.basis.T @ noise)
-        return np.asarray(self.basis @ self.coordinates[chain, draw] + noise)
+            noise -= basis @ (basis.T @ noise)
+        return np.asarray(basis @ self.coordinates[chain, draw, : basis.shape[1]] + noise)

@@ -1,17 +1,23 @@
-"""Step 1, Bayesian PBIRL: draws from p(w | preferences), with their convergence (eqs. 7-8)."""
+"""Step 1, Bayesian PBIRL: draws from p(w, all else | preferences), with their convergence (eqs. 7-8)."""
 
 from dataclasses import dataclass, replace
 
 import jax
+import numpy as np
 import xarray as xr
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
 from bayespbrl.models.chains import CHUNK, Chains
-from bayespbrl.models.convergence import chain_convergence
+from bayespbrl.models.convergence import Convergence, chain_convergence
+from bayespbrl.models.evidence import log_evidence
 from bayespbrl.models.gaussian_fit import fit_gaussian, one_blas_thread
-from bayespbrl.models.posterior_tree import posterior_tree
-from bayespbrl.models.preference_model import PreferenceModel
+from bayespbrl.models.posterior_tree import margins_of, posterior_tree, settings_of
+from bayespbrl.models.preference_model import Answers, PreferenceModel
+
+# A setting that fewer draws have is not diagnosed: how many do is known too badly, and matters little.
+LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -34,11 +40,13 @@ def sample_posterior(
     differences: ArrayLike,
     *,
     prior_scale: float = PreferenceModel.prior_scale,
-    steepness: float = PreferenceModel.steepness,
-    lapse_rate: float = PreferenceModel.lapse_rate,
+    steepness: float | None = PreferenceModel.steepness,
+    lapse_rate: float | None = PreferenceModel.lapse_rate,
     likelihood: str = PreferenceModel.likelihood,
     indifferent: ArrayLike | None = None,
     tie_threshold: float | None = PreferenceModel.tie_threshold,
+    shown_first: ArrayLike | None = None,
+    answerers: ArrayLike | None = None,
     number_of_preferences: int | None = None,
     num_warmup: int = SamplerOptions.num_warmup,
     num_samples: int = SamplerOptions.num_samples,
@@ -48,20 +56,24 @@ def sample_posterior(
 ) -> xr.DataTree:
     """Draw from the posterior of the utility weights w ~ N(0, σ²I) given preferences (eqs. 7-8), until it converges.
 
-    The chains have converged when every margin has R̂ ≤ 1.01 and at least 400 effective draws. This is checked after
-    `num_samples` draws a chain and after every doubling; where it is not met at `max_samples`, `converged` is 0.
-    Everything is computed in float64.
+    What is None is inferred with the weights, and so is which of several settings of the features explains the answers.
+    The chains have converged when every margin, and all else that is inferred, has R̂ ≤ 1.01 and at least 400 effective
+    draws. This is checked after `num_samples` draws a chain and after every doubling; where it is not met at
+    `max_samples`, `converged` is 0. Everything is computed in float64.
 
     Args:
       differences: ψ(preferred) − ψ(dominated), shape (K, D), used as given: divide by a scale of your choice first.
-        A row of zeros has a margin of exactly zero in every draw. K = 0 gives the prior.
+        A row of zeros has a margin of exactly zero in every draw. K = 0 gives the prior. For C settings of the features
+        (length scales, or other features), equally probable a priori: shape (C, K, D).
       prior_scale: σ > 0.
       steepness: m > 0.
       lapse_rate: λ in [0, 1), the share of answers that are coin tosses.
       likelihood: "mixed" (eq. 8), "logistic" or "probit".
-      indifferent: which answers were "no difference", shape (K,) bool; needs `tie_threshold`. The sign of such a row
-        does not matter.
-      tie_threshold: δ > 0: margins within it are often called ties. None: no ties, and no threshold.
+      indifferent: which answers were "no difference", shape (K,) bool. The sign of such a row does not matter.
+      tie_threshold: δ > 0: margins within it are often called ties. None: inferred where there are ties, else none.
+      shown_first: 1 where the preferred one was shown first, −1 where the other was, 0 where nothing is known, shape
+        (K,). The margin by which the answerer favours the first shown is then inferred. None: nobody does.
+      answerers: who gave each answer, numbers from 0, shape (K,): each has a lapse rate. None: one for all.
       number_of_preferences: K of eq. 8, where it is not the number of rows (an answer held out).
       num_warmup: draws a chain that are discarded (burn-in); rounded up to whole chunks of min(num_samples, 25) draws.
       num_samples: draws a chain to begin with, >= 4.
@@ -71,16 +83,18 @@ def sample_posterior(
 
     Returns:
       A tree with the groups
-      `posterior`: margins (chain, draw, preference), coordinates z (chain, draw, coordinate), and utility_weights
-        (chain, draw, feature), which are computed when indexed;
+      `posterior`: margins (chain, draw, preference); coordinates z (chain, draw, coordinate); setting (chain, draw);
+        steepness (chain, draw); lapse_rate (chain, draw, answerer); tie_threshold (chain, draw) where there are ties;
+        side_bias (chain, draw) where `shown_first` is known; and utility_weights (chain, draw, feature), those of the
+        draw's setting, which are computed when indexed;
       `sample_stats`: lp (log likelihood), candidates (per move), stuck, diverging (a likelihood of zero or NaN);
       `log_likelihood`: answers (chain, draw, preference); `observed_data`: answers, 1 as given and 0 for a tie;
-      `constant_data`: differences;
+      `constant_data`: differences, with a dimension `setting` in front where they had one; shown_first, answerers;
       at the root: utility_weights_mean (feature), whose part outside the differences' row space is exactly zero;
-        utility_weights_most_likely (feature), the draw of highest likelihood with the rest at its mean, zero; and the
-        attributes log_evidence (expectation propagation's), log_evidence_converged, rhat_max,
-        effective_sample_size_min, converged, stuck, prior_scale, steepness, lapse_rate, likelihood,
-        number_of_preferences, tie_threshold, seed.
+        utility_weights_most_likely (feature), the draw of highest likelihood with the rest at its mean, zero (both with
+        a dimension `setting` in front where there is one: each setting's part of the sum); and the attributes
+        log_evidence and log_evidence_error (by bridge sampling), rhat_max, effective_sample_size_min, converged, stuck,
+        prior_scale, steepness, lapse_rate, likelihood, number_of_preferences, tie_threshold (NaN: inferred), seed.
       `stored(tree).to_netcdf(path)` writes it without the utility weights; `restored` brings them back.
 
     Raises:
@@ -90,7 +104,7 @@ def sample_posterior(
         differences,
         PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold),
         seed=seed,
-        indifferent=indifferent,
+        answers=Answers(indifferent, shown_first, answerers),
         number_of_preferences=number_of_preferences,
         sampler=SamplerOptions(num_warmup, num_samples, max_samples, num_chains),
     )
@@ -101,24 +115,47 @@ def posterior_draws(
     model: PreferenceModel,
     *,
     seed: int,
-    indifferent: ArrayLike | None = None,
+    answers: Answers = Answers(),
     number_of_preferences: int | None = None,
     sampler: SamplerOptions | None = None,
 ) -> xr.DataTree:
     """`sample_posterior` with its options in objects; `sampler` None for the default `SamplerOptions`."""
     seed = checks.whole("seed", seed, 0)
     sampler = SamplerOptions() if sampler is None else sampler
-    fit = fit_gaussian(differences, model, indifferent=indifferent, number_of_preferences=number_of_preferences)
+    settings = settings_of(differences)
+    answers = answers.checked(settings.shape[1])
+    number = settings.shape[1] if number_of_preferences is None else number_of_preferences
+    options = {"indifferent": answers.indifferent, "number_of_preferences": number}
+    fits = [fit_gaussian(each, model, **options) for each in answers.with_sides(settings, model.prior_scale)]
     with jax.enable_x64(True), one_blas_thread():
-        chunk = min(sampler.num_samples, CHUNK)
-        chains = Chains.start(fit, num_chains=sampler.num_chains, chunk=chunk, seed=seed)
+        chains = Chains.start(
+            fits,
+            num_chains=sampler.num_chains,
+            chunk=min(sampler.num_samples, CHUNK),
+            seed=seed,
+            answerers=answers.answerers,
+        )
         chains = replace(chains.extended(sampler.num_warmup), draws=())
         wanted = sampler.num_samples
         while True:
             chains = chains.extended(wanted - chains.length)
-            report = chain_convergence(chains.collected("coordinates", wanted) @ fit.factors.loadings.T)
+            report = chain_convergence(_diagnosed(chains, wanted, margins_of(fits, chains, wanted)))
             if report.converged() or 2 * wanted > sampler.max_samples:
                 break
             wanted *= 2
-    number = len(fit.differences) if number_of_preferences is None else number_of_preferences
-    return posterior_tree(fit, chains, wanted, report, {"number_of_preferences": int(number), "seed": seed})
+        evidence = log_evidence(chains, wanted, seed=seed)
+    attributes = {"number_of_preferences": int(number), "seed": seed}
+    attributes |= dict(zip(("log_evidence", "log_evidence_error"), evidence, strict=True))
+    return posterior_tree(fits, chains, wanted, report, attributes, np.asarray(differences), answers)
+
+
+def _diagnosed(
+    chains: Chains, length: int, margins: Float[np.ndarray, "chain draw k"]
+) -> Float[np.ndarray, "chain draw n"]:
+    """What must converge: the margins, all that is inferred beside the weights, and membership in each setting."""
+    settings = chains.collected("setting", length)
+    numbers, counts = np.unique(settings, return_counts=True)
+    members = [settings == n for n, count in zip(numbers, counts, strict=True) if count >= LEAST_SHARE * settings.size]
+    values = [chains.values(name, length) for name in ("steepness", "tie_threshold")]
+    columns = [margins, chains.values("lapse_rate", length), *(each[..., None] for each in (*values, *members))]
+    return np.concatenate(columns, axis=2)

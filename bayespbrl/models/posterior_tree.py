@@ -1,86 +1,155 @@
 """A posterior as a DataTree in ArviZ's schema, to keep in memory and on disk."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from xarray.core import indexing
 
+from bayespbrl import checks
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import Convergence
 from bayespbrl.models.gaussian_fit import GaussianFit
 from bayespbrl.models.likelihoods import WithTies
 from bayespbrl.models.low_rank import UtilityWeights, low_rank
+from bayespbrl.models.preference_model import Answers
+from bayespbrl.models.priors import SIDE_BIAS_SCALE
+
+SAMPLE = ("chain", "draw")
+
+
+def settings_of(differences: ArrayLike) -> Float[np.ndarray, "s k d"]:
+    """Differences (K, D) or (C, K, D) as (C, K, D), checked."""
+    array = np.asarray(differences, dtype=np.float64)
+    if array.ndim != 3:
+        array = checks.matrix("differences", array)[None]
+    checks.finite("differences", array)
+    if not array.shape[0] or not array.shape[2]:
+        raise ValueError(f"differences: expected shape (K, D >= 1) or (C, K, D), got {np.shape(differences)}")
+    return array
+
+
+def margins_of(fits: Sequence[GaussianFit], chains: Chains, length: int) -> Float[np.ndarray, "chain {length} k"]:
+    """The margins of the first `length` draws of each chain, each under its own setting."""
+    z, settings = chains.collected("coordinates", length), chains.collected("setting", length)
+    margins = np.empty((*z.shape[:2], len(fits[0].differences)))
+    for number, fit in enumerate(fits):
+        loadings = fit.factors.loadings
+        margins[settings == number] = z[settings == number][:, : loadings.shape[1]] @ loadings.T
+    return margins
 
 
 def posterior_tree(
-    fit: GaussianFit, chains: Chains, length: int, report: Convergence, attributes: Mapping[str, int]
+    fits: Sequence[GaussianFit],
+    chains: Chains,
+    length: int,
+    report: Convergence,
+    attributes: Mapping[str, float],
+    differences: Float[np.ndarray, "*s k d"],
+    answers: Answers,
 ) -> xr.DataTree:
     """The first `length` draws of the chains, with the groups that `sample_posterior` describes.
 
-    `fit` is where the chains began, `report` of the margins' draws, and `attributes` are kept with the tree.
+    `fits` are where the chains began, `report` is of all that is diagnosed, and `attributes` are kept with the tree.
     """
-    sample, answer = ("chain", "draw"), ("chain", "draw", "preference")
-    z, answers = chains.collected("coordinates", length), chains.collected("answers", length)
-    flags = {name: (sample, chains.collected(name, length)) for name in ("candidates", "stuck", "diverging")}
-    lp = np.sum(answers, axis=2)
+    answer, likelihood = (*SAMPLE, "preference"), fits[0].likelihood
+    z, log_p = chains.collected("coordinates", length), chains.collected("answers", length)
+    flags = {name: (SAMPLE, chains.collected(name, length)) for name in ("candidates", "stuck", "diverging")}
+    lp, settings = np.sum(log_p, axis=2), chains.collected("setting", length)
     labels = {"chain": np.arange(z.shape[0]), "draw": np.arange(length)}
-    likelihood, basis = fit.likelihood, fit.factors.basis
-    tied = (
-        np.asarray(likelihood.indifferent) if isinstance(likelihood, WithTies) else np.zeros(len(fit.differences), bool)
-    )
-    most_likely = z[np.unravel_index(np.argmax(lp), lp.shape)]
-    points = {"mean": basis @ z.mean(axis=(0, 1)), "most_likely": basis @ most_likely}
+    tied = np.zeros(len(fits[0].differences), bool) if answers.indifferent is None else np.asarray(answers.indifferent)
     root_attributes = {
         **{
-            name: x if isinstance(x, str) else float("nan" if x is None else x) for name, x in asdict(fit.model).items()
+            name: x if isinstance(x, str) else float("nan" if x is None else x)
+            for name, x in asdict(fits[0].model).items()
         },
         **attributes,
-        "log_evidence": fit.log_evidence,
-        "log_evidence_converged": int(fit.approximation.converged),
         "rhat_max": report.rhat_max,
         "effective_sample_size_min": min(report.effective_sample_size_min, float(lp.size)),
         "converged": int(report.converged() and not np.any(flags["diverging"][1])),
         "stuck": int(np.sum(flags["stuck"][1])),
     }
-    draws = {"margins": (answer, z @ fit.factors.loadings.T), "coordinates": ((*sample, "coordinate"), z)}
-    statistics = {"lp": (sample, lp), **flags}
-    root = xr.Dataset({f"utility_weights_{name}": ("feature", w) for name, w in points.items()}, attrs=root_attributes)
-    return xr.DataTree.from_dict(
+    draws = {
+        "margins": (answer, margins_of(fits, chains, length)),
+        "coordinates": ((*SAMPLE, "coordinate"), z),
+        "setting": (SAMPLE, settings),
+        "steepness": (SAMPLE, chains.values("steepness", length)),
+        "lapse_rate": ((*SAMPLE, "answerer"), chains.values("lapse_rate", length)),
+    }
+    if isinstance(likelihood, WithTies):
+        draws["tie_threshold"] = (SAMPLE, chains.values("tie_threshold", length))
+    known = {name: ("preference", x) for name, x in asdict(answers).items() if x is not None and name != "indifferent"}
+    dimensions = ("setting", "preference", "feature")[3 - differences.ndim :]
+    tree = xr.DataTree.from_dict(
         {
-            "/": root,
-            "/posterior": _with_weights(xr.Dataset(draws, labels), basis, root_attributes),
-            "/sample_stats": xr.Dataset(statistics, labels),
-            "/log_likelihood": xr.Dataset({"answers": (answer, answers)}, labels),
+            "/": xr.Dataset(attrs=root_attributes),
+            "/posterior": xr.Dataset(draws, labels),
+            "/sample_stats": xr.Dataset({"lp": (SAMPLE, lp), **flags}, labels),
+            "/log_likelihood": xr.Dataset({"answers": (answer, log_p)}, labels),
             "/observed_data": xr.Dataset({"answers": ("preference", (~tied).astype(np.int8))}),
-            "/constant_data": xr.Dataset({"differences": (("preference", "feature"), fit.differences)}),
+            "/constant_data": xr.Dataset({"differences": (dimensions, differences), **known}),
         }
     )
+    return restored(tree)
 
 
-def _with_weights(posterior: xr.Dataset, basis: Float[np.ndarray, "d r"], settings: Mapping[Any, Any]) -> xr.Dataset:
-    z = posterior["coordinates"].values
-    lazy = UtilityWeights(z, basis, prior_scale=float(settings["prior_scale"]), seed=int(settings["seed"]))
-    weights = xr.Variable(("chain", "draw", "feature"), indexing.LazilyIndexedArray(lazy))
-    return posterior.assign(utility_weights=weights)
+def answers_of(tree: xr.DataTree) -> Answers:
+    """What is known of the answers that a tree was fitted to."""
+    known = tree.children["constant_data"].dataset
+    tied = np.asarray(tree.children["observed_data"]["answers"]) == 0
+    parts = {name: known[name].values.astype(int) for name in ("shown_first", "answerers") if name in known}
+    return Answers(tied if tied.any() else None, **parts)
+
+
+def bases_of(tree: xr.DataTree) -> list[Float[np.ndarray, "d r"]]:
+    """Q of each setting, of the features and, where there is one, the side."""
+    settings = settings_of(tree.children["constant_data"]["differences"].values)
+    augmented = answers_of(tree).with_sides(settings, float(tree.attrs["prior_scale"]))
+    return [low_rank(each).basis for each in augmented]
 
 
 def stored(tree: xr.DataTree) -> xr.DataTree:
-    """The tree without the computed `posterior["utility_weights"]`, to write to disk; `restored` brings it back."""
-    posterior = tree.children["posterior"].to_dataset(inherit=False).drop_vars("utility_weights", errors="ignore")
-    return _replaced(tree, posterior)
+    """The tree without what `restored` computes, to write to disk."""
+    posterior = tree.children["posterior"].to_dataset(inherit=False)
+    return _replaced(tree, posterior.drop_vars(["utility_weights", "side_bias"], errors="ignore"), xr.Dataset(attrs=tree.attrs))
 
 
 def restored(tree: xr.DataTree) -> xr.DataTree:
-    """A tree read back from disk, with `posterior["utility_weights"]` computed where it is indexed, as before."""
-    basis = low_rank(tree.children["constant_data"].to_dataset()["differences"].values).basis
-    posterior = tree.children["posterior"].to_dataset(inherit=False)
-    return _replaced(tree, _with_weights(posterior, basis, tree.attrs))
+    """The tree with `posterior["utility_weights"]`, computed where it is indexed, the side bias, and points for all."""
+    bases, posterior = bases_of(tree), tree.children["posterior"].to_dataset(inherit=False)
+    z, settings, several = posterior["coordinates"].values, posterior["setting"].values, len(bases) > 1
+    differences = tree.children["constant_data"]["differences"]
+    width, several = differences.shape[-1], differences.ndim == 3
+    lazy = UtilityWeights(
+        z, bases, settings, prior_scale=float(tree.attrs["prior_scale"]), seed=int(tree.attrs["seed"])
+    )
+    weights = xr.Variable((*SAMPLE, "feature"), indexing.LazilyIndexedArray(lazy))
+    posterior = posterior.assign(utility_weights=weights[:, :, :width])
+    if "shown_first" in tree.children["constant_data"].dataset:
+        rows = np.zeros(z.shape)
+        for number, basis in enumerate(bases):
+            rows[settings == number, : basis.shape[1]] = basis[-1]
+        scale = SIDE_BIAS_SCALE / float(tree.attrs["prior_scale"])
+        posterior = posterior.assign(side_bias=(SAMPLE, scale * np.sum(rows * z, axis=2)))
+    lp = tree.children["sample_stats"]["lp"].values
+    best = np.zeros(lp.shape, bool)
+    best[np.unravel_index(np.argmax(lp), lp.shape)] = True
+    points = {}
+    for name, share in (("mean", np.full(lp.shape, 1 / lp.size)), ("most_likely", best.astype(float))):
+        parts = np.zeros((len(bases), width))
+        for number, basis in enumerate(bases):
+            chosen = settings == number
+            parts[number] = (basis @ (share[chosen] @ z[chosen][:, : basis.shape[1]]))[:width]
+        points[f"utility_weights_{name}"] = (
+            (("setting", "feature"), parts) if several else (("feature",), parts[0])
+        )
+    return _replaced(tree, posterior, xr.Dataset(points, attrs=tree.attrs))
 
 
-def _replaced(tree: xr.DataTree, posterior: xr.Dataset) -> xr.DataTree:
+def _replaced(tree: xr.DataTree, posterior: xr.Dataset, root: xr.Dataset) -> xr.DataTree:
     groups = {path: node.to_dataset(inherit=False) for path, node in tree.subtree_with_keys}
-    return xr.DataTree.from_dict({**groups, "posterior": posterior})
+    return xr.DataTree.from_dict({**groups, ".": root, "posterior": posterior})

@@ -1,6 +1,6 @@
 """The model of Bayesian PBIRL (eqs. 7-8): its options, and its form in NumPyro."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,79 +11,121 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
-from bayespbrl.models.likelihoods import (
-    LIKELIHOODS,
-    Likelihood,
-    Logistic,
-    Mixed,
-    Probit,
-    Scalar,
-    WithLapses,
-    WithTies,
-    log_prob,
-)
+from bayespbrl.models import priors
+from bayespbrl.models.likelihoods import LIKELIHOODS, Likelihood, Scalar, likelihood_of, log_prob
+from bayespbrl.models.priors import Grid
 
 
 @dataclass(frozen=True)
 class PreferenceModel:
     """Prior and likelihood (eqs. 7-8): w ~ N(0, σ²I), and the probability of an answer given its margin t = wᵀψ.
 
-    Differences ψ have the unit of the features; the learner divides them by their largest absolute entry. Without ties
-    the answers depend on σ·m alone.
+    Without ties the answers depend on σ·m alone. What is None is inferred, with the priors of `bayespbrl.models.priors`.
 
     Attributes:
       prior_scale: σ > 0, standard deviation of each weight, in utility per feature.
-      steepness: m > 0, slope of the sigmoid, in 1/utility.
-      lapse_rate: λ in [0, 1), the probability that an answer is a coin toss.
+      steepness: m > 0, slope of the sigmoid, in 1/utility; None: inferred.
+      lapse_rate: λ in [0, 1), the probability that an answer is a coin toss; None: inferred, for each answerer.
       likelihood: "mixed" (eq. 8), "logistic" (Bradley-Terry) or "probit" (Thurstone).
-      tie_threshold: δ > 0, in utility: margins within it are often answered with "no difference". None: there are no
-        such answers.
+      tie_threshold: δ > 0, in utility: margins within it are often answered with "no difference". None: inferred where
+        there are such answers, and no threshold where there are none.
     """
 
     prior_scale: float = 1.0
-    steepness: float = 5.0
-    lapse_rate: float = 0.0
+    steepness: float | None = 5.0
+    lapse_rate: float | None = 0.0
     likelihood: str = "mixed"
     tie_threshold: float | None = None
 
     def __post_init__(self) -> None:
         checks.positive("prior_scale", self.prior_scale)
-        checks.positive("steepness", self.steepness)
-        checks.share("lapse_rate", self.lapse_rate, below_one=True)
         checks.one_of("likelihood", self.likelihood, LIKELIHOODS)
+        if self.steepness is not None:
+            checks.positive("steepness", self.steepness)
+        if self.lapse_rate is not None:
+            checks.share("lapse_rate", self.lapse_rate, below_one=True)
         if self.tie_threshold is not None:
             checks.positive("tie_threshold", self.tie_threshold)
 
+    @property
+    def steepness_prior(self) -> Grid:
+        """The prior of m."""
+        return priors.STEEPNESS if self.steepness is None else priors.given(self.steepness)
+
+    @property
+    def lapse_rate_prior(self) -> Grid:
+        """The prior of each answerer's λ."""
+        return priors.LAPSE_RATE if self.lapse_rate is None else priors.given(self.lapse_rate)
+
+    @property
+    def tie_threshold_prior(self) -> Grid:
+        """The prior of δ, where there is a threshold."""
+        return priors.TIE_THRESHOLD if self.tie_threshold is None else priors.given(self.tie_threshold)
+
     def answer_likelihood(self, number_of_preferences: int, indifferent: ArrayLike | None = None) -> Likelihood:
-        """The probability of each answer as a function of its margin.
+        """The probability of each answer as a function of its margin; what is inferred is at its prior's mean.
 
         Args:
           number_of_preferences: K of eq. 8.
-          indifferent: which answers were "no difference", bool, one entry for each margin; needs `tie_threshold`. None
-            for K answers of which none was.
+          indifferent: which answers were "no difference", bool, one entry for each margin; None for K answers of which
+            none was.
 
         Raises:
-          ValueError: indifferent answers without a tie threshold, or an `indifferent` that is not a vector of bool.
+          ValueError: an `indifferent` that is not a vector of bool.
         """
-        steepness = float(self.steepness)
-        likelihood: Mixed | Logistic | Probit | WithLapses
-        match self.likelihood:
-            case "mixed":
-                likelihood = Mixed(steepness, float(max(number_of_preferences, 1)))
-            case "logistic":
-                likelihood = Logistic(steepness)
-            case _:
-                likelihood = Probit(steepness)
-        if self.lapse_rate > 0:
-            likelihood = WithLapses(likelihood, float(self.lapse_rate))
         tied = np.zeros(number_of_preferences, dtype=bool) if indifferent is None else np.asarray(indifferent)
-        if self.tie_threshold is None:
-            if np.any(tied):
-                raise ValueError("tie_threshold: expected a number > 0 because some answers are indifferent, got None")
-            return likelihood
         if tied.ndim != 1 or tied.dtype != bool:
             raise ValueError(f"indifferent: expected a vector of bool, got {tied.dtype} of shape {tied.shape}")
-        return WithTies(likelihood, float(self.tie_threshold), tied)
+        threshold = self.tie_threshold is not None or bool(np.any(tied))
+        return likelihood_of(
+            self.likelihood,
+            float(max(number_of_preferences, 1)),
+            steepness=self.steepness_prior.mean,
+            lapse_rate=None if self.lapse_rate == 0 else self.lapse_rate_prior.mean,
+            tie_threshold=self.tie_threshold_prior.mean if threshold else None,
+            indifferent=tied,
+        )
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What is known of K answers beside the order that the differences state; None: nothing.
+
+    Attributes:
+      indifferent, shown_first, answerers: as of `sample_posterior`, shape (K,).
+    """
+
+    indifferent: ArrayLike | None = None
+    shown_first: ArrayLike | None = None
+    answerers: ArrayLike | None = None
+
+    def checked(self, number: int) -> "Answers":
+        """The same as arrays; `ValueError` where one is not of shape (`number`,) or not of its kind."""
+        tied, sides, who = self.indifferent, self.shown_first, self.answerers
+        return Answers(
+            None if tied is None else checks.flags("indifferent", tied, number),
+            None if sides is None else _numbers("shown_first", sides, number, -1, 1).astype(float),
+            None if who is None else _numbers("answerers", who, number, 0, number),
+        )
+
+    def of(self, rows: np.ndarray) -> "Answers":
+        """Those of some rows."""
+        return Answers(*(None if part is None else np.asarray(part)[rows] for part in astuple(self)))
+
+    def with_sides(self, differences: Float[np.ndarray, "*s k d"], prior_scale: float) -> Float[np.ndarray, "*s k e"]:
+        """The differences with one more feature, the side, whose weight is the side bias over its scale."""
+        if self.shown_first is None:
+            return differences
+        column = np.asarray(self.shown_first) * priors.SIDE_BIAS_SCALE / prior_scale
+        column = np.broadcast_to(column[:, None], (*differences.shape[:-1], 1))
+        return np.concatenate([differences, column], axis=-1)
+
+
+def _numbers(name: str, values: ArrayLike, number: int, least: int, most: int) -> np.ndarray:
+    array = np.asarray(values)
+    if array.shape != (number,) or array.dtype.kind not in "iu" or np.any((array < least) | (array > most)):
+        raise ValueError(f"{name}: expected {number} whole numbers in {least} … {most}, got {values!r}")
+    return array
 
 
 def preference_model(

@@ -1,8 +1,11 @@
 """The model of eqs. 7-8 after the thin factorisation, with a Gaussian reference, and the ellipses that sample it fast.
 
+It is conditional on all that is not a weight; `bayespbrl.models.gibbs` samples that.
+
 Arrays are padded, so that problems of different size share a compilation.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -17,7 +20,7 @@ from bayespbrl.models.preference_model import preference_model
 
 
 class PreferenceProblem(NamedTuple):
-    """t = L z, z ~ N(0, σ²I): what the compiled sampler takes, every array padded to the capacity c ≥ K, r.
+    """t = L z, z ~ N(0, σ²I): what the compiled sampler takes, padded to capacities c ≥ K and q ≥ r.
 
     Attributes:
       loadings: L.
@@ -29,14 +32,14 @@ class PreferenceProblem(NamedTuple):
       root, inverse_root: A, with AAᵀ the reference's covariance, and A⁻¹.
     """
 
-    loadings: Float[Array, "c c"]
+    loadings: Float[Array, "c q"]
     used: Bool[Array, " c"]
     likelihood: Likelihood
     prior_scale: Scalar
-    centre: Float[Array, " c"]
+    centre: Float[Array, " q"]
     site_precisions: Float[Array, " c"]
-    root: Float[Array, "c c"]
-    inverse_root: Float[Array, "c c"]
+    root: Float[Array, "q q"]
+    inverse_root: Float[Array, "q q"]
 
 
 def low_rank_model(problem: PreferenceProblem) -> None:
@@ -52,12 +55,12 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
     Rows that are not used have a margin of zero everywhere, so that they are constants too.
     """
     loadings, centre = problem.loadings, problem.centre
-    number = len(loadings)
+    number, rank = loadings.shape
     map_displacement = jnp.concatenate([loadings, centre[None] / problem.prior_scale**2])
     map_noise = (map_displacement @ problem.root).T
     margins_at_centre = loadings @ centre
 
-    def lift(z: Float[Array, " c"]) -> Float[Array, " v"]:
+    def lift(z: Float[Array, " q"]) -> Float[Array, " v"]:
         return jnp.concatenate([map_displacement @ (z - centre), problem.inverse_root @ (z - centre)])
 
     def residual(v: Float[Array, "j v"]) -> Float[Array, " j"]:
@@ -66,7 +69,7 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
         return log_likelihood + 0.5 * jnp.sum(problem.site_precisions * margins**2, axis=-1) - tilt
 
     def noise(key: PRNGKeyArray, moves: int) -> Float[Array, "{moves} v"]:
-        whitened = random.normal(key, (moves, number), dtype=loadings.dtype)
+        whitened = random.normal(key, (moves, rank), dtype=loadings.dtype)
         return jnp.concatenate([whitened @ map_noise, whitened], axis=1)
 
     return Ellipse(lift, noise, residual, lambda v: centre + problem.root @ v[number + 1 :])
@@ -91,8 +94,9 @@ def padded_problem(
     prior_scale: float,
     mean: Float[np.ndarray, " r"],
     site_precisions: Float[np.ndarray, " k"],
+    rank_at_least: int = 0,
 ) -> PreferenceProblem:
-    """Pad K answers and rank r to a capacity; padded coordinates keep the prior.
+    """Pad K answers and rank r to capacities; padded coordinates keep the prior.
 
     Args:
       loadings: L; rows of exactly zero are not used.
@@ -100,18 +104,20 @@ def padded_problem(
       prior_scale: σ.
       mean: of the reference.
       site_precisions: s >= 0 of the reference's precision I/σ² + Lᵀ diag(s) L.
+      rank_at_least: so that problems of different rank can be stacked.
     """
     number, rank = loadings.shape
-    capacity = _capacity(number)
+    capacity, wide = _capacity(number), _capacity(max(rank, rank_at_least))
     precisions, used = np.zeros(capacity), np.zeros(capacity, dtype=bool)
     used[:number] = used_rows(loadings)
     precisions[:number] = site_precisions
-    padded, centre = np.zeros((capacity, capacity)), np.zeros(capacity)
+    padded, centre = np.zeros((capacity, wide)), np.zeros(wide)
     padded[:number, :rank], centre[:rank] = loadings, mean
-    root, inverse_root = prior_scale * np.eye(capacity), np.eye(capacity) / prior_scale
+    root, inverse_root = prior_scale * np.eye(wide), np.eye(wide) / prior_scale
     if rank:
         precision = np.eye(rank) / prior_scale**2 + loadings.T @ (site_precisions[:, None] * loadings)
-        inverse_root[:rank, :rank] = np.linalg.cholesky(precision).T
+        # A is lower triangular, as L is: whitened coordinates mean alike under different features
+        inverse_root[:rank, :rank] = np.linalg.cholesky(precision[::-1, ::-1])[::-1, ::-1].T
         root[:rank, :rank] = np.linalg.inv(inverse_root[:rank, :rank])
     arrays = [jnp.asarray(a) for a in (padded, used, centre, precisions, root, inverse_root)]
     return PreferenceProblem(
@@ -132,7 +138,6 @@ def _capacity(number: int) -> int:
 def _padded_likelihood(likelihood: Likelihood, capacity: int) -> Likelihood:
     """The likelihood with an entry for every padded row."""
     if isinstance(likelihood, WithTies):
-        indifferent = np.zeros(capacity, dtype=bool)
-        indifferent[: len(likelihood.indifferent)] = likelihood.indifferent
-        return WithTies(likelihood.ordered, likelihood.threshold, indifferent)
+        tied = np.asarray(likelihood.indifferent)
+        return replace(likelihood, indifferent=np.pad(tied, (0, capacity - len(tied))))
     return likelihood

@@ -23,7 +23,7 @@ from bayespbrl.runs.files import write_file
 from bayespbrl.runs.iteration_files import read_iteration, write_iteration
 from bayespbrl.settings import OPTIONS, Settings
 
-FORMAT = 2  # format 1 named classes by their modules
+FORMAT = 3  # format 2 had one setting's posterior beside an average; format 1 named classes by their modules
 HEAVY = ("collected", "improved")  # events with heavy parts, in the file of their iteration
 Event = dict[str, Any]
 

@@ -13,7 +13,7 @@ from bayespbrl.models import restored, stored
 from bayespbrl.runs.files import written_aside
 from bayespbrl.runs.stored_classes import from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility import AveragedUtility, FitQuality, LinearProgramUtility, PosteriorUtility, UtilityEstimate
+from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEstimate
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Final = "h5netcdf"
@@ -100,35 +100,27 @@ def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
     )
 
 
-AVERAGE = {
-    "multiples": ("component", "dimension"),
-    "probabilities": ("component",),
-    "means": ("component", "feature"),
-    "components": ("draw",),
-    "weight_draws": ("draw", "feature"),
-}
-
-
 def _estimate_groups(estimate: UtilityEstimate) -> dict[str, xr.DataTree]:
     """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
-    if isinstance(estimate, LinearProgramUtility):
-        return {"utility": _weights_group(estimate, estimate.quality)}
-    if (fit := estimate.sampled) is None:
+    if not isinstance(estimate, PosteriorUtility | LinearProgramUtility):
         return {"utility": to_tree(estimate)}
-    groups = {"utility": _weights_group(fit, estimate.quality)}
-    if isinstance(estimate, AveragedUtility):
-        data = xr.Dataset({name: (dimensions, getattr(estimate, name)) for name, dimensions in AVERAGE.items()})
-        groups["average"] = xr.DataTree(data, children=_function_group("base", estimate.base))
-    return groups | _posterior_groups(fit.posterior)
-
-
-def _weights_group(estimate: PosteriorUtility | LinearProgramUtility, quality: FitQuality) -> xr.DataTree:
-    attributes: dict[str, Any] = {"discount": estimate.discount, "scale": estimate.scale}
+    if isinstance(estimate, LinearProgramUtility):
+        variables: dict[str, Any] = {"weights": ("feature", estimate.weights)}
+        attributes: dict[str, Any] = {"discount": estimate.discount, "scale": estimate.scale}
+    else:
+        rows = {"weights": (("setting", "feature"), estimate.weights), "scales": ("setting", estimate.scales)}
+        variables = {"multiples": (("setting", "dimension"), estimate.multiples), **rows}
+        attributes = {"discount": estimate.discount}
     functions = _function_group("features", estimate.features)
     if not functions:
         attributes["features"] = "other"  # the user's function, which has to be passed again
-    data = xr.Dataset({"weights": ("feature", estimate.weights)}, attrs=attributes)
-    return xr.DataTree(data, children={"quality": to_tree(quality), **functions})
+    children = {"quality": to_tree(estimate.quality), **functions}
+    groups = {"utility": xr.DataTree(xr.Dataset(variables, attrs=attributes), children=children)}
+    if isinstance(estimate, PosteriorUtility):
+        small = stored(estimate.posterior)
+        groups |= {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
+        groups["fit"] = xr.DataTree(small.to_dataset())
+    return groups
 
 
 def _function_group(name: str, features: StateFeatures) -> dict[str, xr.DataTree]:
@@ -139,12 +131,6 @@ def _function_group(name: str, features: StateFeatures) -> dict[str, xr.DataTree
         return {}
 
 
-def _posterior_groups(posterior: xr.DataTree) -> dict[str, xr.DataTree]:
-    small = stored(posterior)
-    groups = {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
-    return {**groups, "fit": xr.DataTree(small.to_dataset())}
-
-
 def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Sequence[type]) -> UtilityEstimate:
     utility = tree.children["utility"]
     if "class" in utility.attrs:
@@ -153,16 +139,10 @@ def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Seq
         features = from_tree(utility.children["features"], known=known)
     if features is None:
         raise ValueError("a run with features of the user's own: pass them again as features=")
-    weights, discount = utility.dataset["weights"].values, float(utility.attrs["discount"])
-    quality, scale = from_tree(utility.children["quality"]), float(utility.attrs["scale"])
+    data, discount, quality = utility.dataset, float(utility.attrs["discount"]), from_tree(utility.children["quality"])
     if "fit" not in tree.children:
-        return LinearProgramUtility(features, weights, discount, quality, scale)
+        return LinearProgramUtility(features, data["weights"].values, discount, quality, float(utility.attrs["scale"]))
     groups = {name: tree.children[name] for name in POSTERIOR_GROUPS if name in tree.children}
     posterior = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
-    sampled = PosteriorUtility(features, weights, discount, quality, posterior, scale)
-    if "average" not in tree.children:
-        return sampled
-    average = tree.children["average"]
-    base = from_tree(average.children["base"], known=known) if "base" in average.children else features
-    arrays: dict[str, Any] = {name: average.dataset[name].values for name in AVERAGE}
-    return AveragedUtility(sampled=sampled, quality=quality, base=base, **arrays)
+    arrays = [data[name].values for name in ("multiples", "scales", "weights")]
+    return PosteriorUtility(features, *arrays, discount, quality, posterior)

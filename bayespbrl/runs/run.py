@@ -159,8 +159,7 @@ class Run:
     @property
     def posterior(self) -> xr.DataTree | None:
         """Posterior draws of the last fit in ArviZ's schema; None where the estimate is no posterior."""
-        sampled = None if self.estimate is None else self.estimate.sampled
-        return None if sampled is None else sampled.posterior
+        return None if self.estimate is None else self.estimate.posterior
 
     def evaluate(self, episodes: int = 100, seed: int = 0) -> float:
         """Mean undiscounted return of the last, stochastic policy over fresh episodes."""

@@ -3,13 +3,11 @@
 comparisons        the data: differences of features (eq. 5)
 inference          the estimate by the chosen method, and the posterior without a learner
 estimate, quality  the protocol of all estimates, and how far one can be trusted
-posterior_utility  a posterior with draws (eqs. 7-8)
+posterior_utility  the posterior over everything, and the utility that is acted on (eqs. 7-8)
 point_estimates    the linear program (eq. 10) and the known reward
-hyperparameters    length scales, steepness and lapse rate by marginal likelihood
-averaging          the average over length scales and steepness
+length_scales      the settings of the features that the posterior is over
 """
 
-from bayespbrl.utility.averaging import AveragedUtility
 from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.inference import infer_utility
 from bayespbrl.utility.point_estimates import KnownReward, LinearProgramUtility
@@ -17,7 +15,6 @@ from bayespbrl.utility.posterior_utility import PosteriorUtility
 from bayespbrl.utility.quality import FitQuality
 
 __all__ = [
-    "AveragedUtility",
     "FitQuality",
     "KnownReward",
     "LinearProgramUtility",

@@ -1,63 +1,77 @@
 """What was compared: the data of step 1, as differences of features (paper, eq. 5)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from bayespbrl.features import RadialBasis, StateFeatures
+from bayespbrl.features import StateFeatures
+from bayespbrl.models import Answers
 from bayespbrl.preferences import pair_differences
 from bayespbrl.trajectories import Trajectory, trajectory_features
 
 
 @dataclass(frozen=True)
 class Comparisons:
-    """The trajectories that some answer is about, and the ordered pairs that follow from the answers.
+    """The trajectories that some answer is about, and the pairs that follow from the answers.
 
     Attributes:
       trajectories: n of them.
-      pairs: K ordered pairs (preferred, dominated) of their numbers.
+      pairs: K pairs (preferred, dominated) of their numbers; the order of a tie does not matter.
       discount: γ of ψ.
+      answers: which of them are ties, which side was shown first, and who answered.
     """
 
     trajectories: tuple[Trajectory, ...]
     pairs: tuple[tuple[int, int], ...]
     discount: float
+    answers: Answers = field(default_factory=Answers)
 
     @classmethod
     def among(
-        cls, trajectories: Sequence[Trajectory], pairs: Sequence[tuple[int, int]], *, discount: float
+        cls,
+        trajectories: Sequence[Trajectory],
+        pairs: Sequence[tuple[int, int]],
+        *,
+        discount: float,
+        ties: Sequence[tuple[int, int]] = (),
     ) -> "Comparisons":
-        """Those of `trajectories` that `pairs` name, or the first where they name none: others cost no features."""
-        numbers = sorted({number for pair in pairs for number in pair} or {0})
+        """Those of `trajectories` that `pairs` and `ties` name, or the first where they name none."""
+        every = (*pairs, *ties)
+        numbers = sorted({number for pair in every for number in pair} or {0})
         row = {number: position for position, number in enumerate(numbers)}
-        return cls(tuple(trajectories[n] for n in numbers), tuple((row[i], row[j]) for i, j in pairs), discount)
+        tied = np.arange(len(every)) >= len(pairs)
+        return cls(
+            tuple(trajectories[n] for n in numbers),
+            tuple((row[i], row[j]) for i, j in every),
+            discount,
+            Answers(indifferent=tied if ties else None),
+        )
+
+    @property
+    def ordered(self) -> np.ndarray:
+        """Which pairs state an order, shape (K,) bool."""
+        tied = self.answers.indifferent
+        return np.ones(len(self.pairs), bool) if tied is None else ~np.asarray(tied)
 
     def feature_sums(self, features: StateFeatures) -> Float[np.ndarray, "n d"]:
         """ψ(τ) of each trajectory."""
         return trajectory_features(self.trajectories, features, discount=self.discount)
 
-    def scaled_differences(self, features: StateFeatures) -> tuple[Float[np.ndarray, "k d"], float]:
-        """`scaled_differences` of the pairs under φ."""
-        return scaled_differences(pair_differences(self.pairs, self.feature_sums(features)))
+    def differences(self, feature_sums: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
+        """ψ(preferred) − ψ(dominated) of each pair."""
+        return pair_differences(self.pairs, feature_sums)
 
 
-def scaled_differences(differences: Float[np.ndarray, "k d"]) -> tuple[Float[np.ndarray, "k d"], float]:
-    """Differences divided by their largest absolute entry, and that entry.
+def normalised(differences: Float[np.ndarray, "k d"]) -> tuple[Float[np.ndarray, "k d"], float]:
+    """Differences over their root mean square length, and that.
 
-    Decision: prior scale and steepness apply to differences of this size, so that they need no unit.
+    Decision: under w ~ N(0, I) the margins wᵀψ then have the variance 1 in the mean over the answers, whatever the
+    features. The answers do not tell the amplitude of the utility. Fixed like this it is the same under all settings of
+    the features, so that a setting counts in a mean of utilities by its probability alone; and steepness, tie threshold
+    and side bias mean the same under each.
     """
-    scale = float(np.max(np.abs(differences), initial=0.0)) or 1.0
+    scale = float(np.sqrt(np.mean(np.sum(differences**2, axis=1)))) if len(differences) else 1.0
+    scale = scale or 1.0
     return differences / scale, scale
-
-
-def number_of_bandwidths(features: StateFeatures) -> int:
-    """S where φ has a bandwidth in each state dimension, 0 where it has none."""
-    return len(features.bandwidths) if isinstance(features, RadialBasis) else 0
-
-
-def rescaled(features: StateFeatures, multiples: ArrayLike) -> StateFeatures:
-    """φ with `multiples` of its bandwidths, where it has any."""
-    return features.rescaled(multiples) if isinstance(features, RadialBasis) else features

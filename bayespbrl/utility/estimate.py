@@ -1,21 +1,21 @@
 """What the other steps ask of a utility estimate: the protocol of its kinds."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
+from xarray import DataTree
 
 from bayespbrl.models.likelihoods import Likelihood
 from bayespbrl.trajectories import Trajectory, Transitions
-from bayespbrl.utility.posterior_utility import PosteriorUtility
 from bayespbrl.utility.quality import FitQuality
 
 
 class UtilityEstimate(Protocol):
     """An estimate of the expert's utility: a point, or a posterior with draws.
 
-    `sampled` says which. Where it is None the methods that need a posterior (`likelihood`, `trajectory_draws`,
+    `posterior` says which. Where it is None the methods that need one (`likelihood`, `trajectory_draws`,
     `margin_draws`, `utilities_and_draws`) raise a ValueError.
     """
 
@@ -25,13 +25,16 @@ class UtilityEstimate(Protocol):
         ...
 
     @property
-    def sampled(self) -> PosteriorUtility | None:
-        """The posterior that was sampled and whose convergence `quality` reports; None for a point estimate."""
+    def posterior(self) -> DataTree | None:
+        """The draws whose convergence `quality` reports and which all else is of; None for a point estimate."""
         ...
 
-    @property
-    def likelihood(self) -> Likelihood:
-        """Of the next answer, as a function of its margin: the difference of two utilities wᵀψ."""
+    def likelihood(self, number: int | None = None) -> Likelihood:
+        """Of the next answer given its margin under each of S draws, at most `number`: margins have shape (S, n)."""
+        ...
+
+    def hyperparameters(self) -> dict[str, Any] | None:
+        """What was inferred beside the weights, as plain data; None where nothing was."""
         ...
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
@@ -62,10 +65,12 @@ class UtilityEstimate(Protocol):
 class WithoutDraws:
     """The part of the protocol that a point estimate lacks."""
 
-    sampled = None
+    posterior = None
 
-    @property
-    def likelihood(self) -> Likelihood:
+    def hyperparameters(self) -> None:
+        """None: nothing."""
+
+    def likelihood(self, number: int | None = None) -> Likelihood:
         """None: a ValueError."""
         raise self._no_posterior("likelihood")
 

@@ -9,13 +9,12 @@ from xarray import DataTree
 
 from bayespbrl import checks
 from bayespbrl.features import StateFeatures
-from bayespbrl.models import PreferenceModel, linear_program, posterior_draws
-from bayespbrl.models.low_rank import low_rank
+from bayespbrl.models import Answers, PreferenceModel, linear_program, posterior_draws
+from bayespbrl.models.posterior_tree import bases_of
 from bayespbrl.preferences import pair_differences
-from bayespbrl.utility.averaging import average_utility
-from bayespbrl.utility.comparisons import Comparisons, scaled_differences
+from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
-from bayespbrl.utility.hyperparameters import HyperparameterChoice, choose_hyperparameters
+from bayespbrl.utility.length_scales import rescaled, settings
 from bayespbrl.utility.point_estimates import KnownReward, LinearProgramUtility
 from bayespbrl.utility.posterior_utility import PosteriorUtility
 from bayespbrl.utility.quality import FitQuality
@@ -31,149 +30,149 @@ class Estimation:
 
     Attributes:
       utility: the method, one of `METHODS`; `known-reward` is the hidden reward itself, for reference runs.
-      hyperparameters: `evidence` chooses length scales, steepness and lapse rate by the marginal likelihood of the
-        answers, beginning at the given ones; `averaged` averages over length scales and steepness; `given` keeps all.
+      hyperparameters: `inferred`: the length scales of the features are part of the posterior, and so are steepness and
+        lapse rate unless they are set; `given` keeps all.
       trajectory_discount: γ of ψ(τ) in the answers; None for the critic's, as in the paper; 1 for an expert who judges
         whole trajectories.
     """
 
     utility: str = "posterior-mean"
-    hyperparameters: str = "evidence"
+    hyperparameters: str = "inferred"
     trajectory_discount: float | None = None
 
     def __post_init__(self) -> None:
         checks.one_of("utility", self.utility, METHODS)
-        checks.one_of("hyperparameters", self.hyperparameters, ("evidence", "given", "averaged"))
+        checks.one_of("hyperparameters", self.hyperparameters, ("inferred", "given"))
         if self.trajectory_discount is not None:
             checks.share("trajectory_discount", self.trajectory_discount)
-        if self.hyperparameters == "averaged" and self.utility != "posterior-mean":
-            raise ValueError(f"utility: expected posterior-mean with averaged hyperparameters, got {self.utility!r}")
 
 
 def estimate(
     comparisons: Comparisons, features: StateFeatures, options: Estimation, model: PreferenceModel, *, seed: int
-) -> tuple[UtilityEstimate, HyperparameterChoice | None]:
-    """The utility by the chosen method, with its hyperparameters, and the choice of these where there was one.
+) -> UtilityEstimate:
+    """The utility by the chosen method.
 
     Args:
       comparisons: the answers.
       features: φ as given.
       options: method and hyperparameters.
-      model: prior and likelihood as given.
-      seed: of everything random.
-    """
-    choice, fitted = None, (features, model)
-    if options.hyperparameters != "given" and options.utility != "known-reward":
-        choice = choose_hyperparameters(comparisons, features, model)
-        fitted = (choice.features, choice.model)
-    utility = estimate_utility(comparisons, *fitted, method=options.utility, seed=seed)
-    if options.hyperparameters == "averaged" and comparisons.pairs and isinstance(utility, PosteriorUtility):
-        return average_utility(utility, comparisons, features, model=model, seed=seed), choice
-    return utility, choice
-
-
-def estimate_utility(
-    comparisons: Comparisons, features: StateFeatures, model: PreferenceModel, *, method: str, seed: int = 0
-) -> PosteriorUtility | LinearProgramUtility | KnownReward:
-    """The utility that explains the answers, under one setting; weights in the units of the features.
-
-    Args:
-      comparisons: the answers.
-      features: φ, (N, S) states to (N, D).
       model: prior and likelihood.
-      method: one of `METHODS`.
-      seed: of the sampler.
+      seed: of everything random.
 
     Source: paper, eqs. 5-10.
     """
-    if method == "known-reward":
+    if options.utility == "known-reward":
         returns = np.array([trajectory.total_reward for trajectory in comparisons.trajectories])
-        satisfied = sum(bool(returns[i] > returns[j]) for i, j in comparisons.pairs)
-        return KnownReward(FitQuality(True, "known reward", len(comparisons.pairs), satisfied))
-    return _fitted(comparisons.feature_sums(features), comparisons, features, model, method, seed)
+        ordered = [pair for pair, stated in zip(comparisons.pairs, comparisons.ordered, strict=True) if stated]
+        satisfied = sum(bool(returns[i] > returns[j]) for i, j in ordered)
+        return KnownReward(FitQuality(True, "known reward", len(ordered), satisfied))
+    if options.utility == "linear-program":
+        return _by_linear_program(comparisons.feature_sums(features), comparisons, features)
+    rng = np.random.default_rng([seed, 2])
+    multiples = settings(features, inferred=options.hyperparameters == "inferred", rng=rng)
+    sums = [comparisons.feature_sums(rescaled(features, row)) for row in multiples]
+    return _by_posterior(sums, multiples, comparisons, features, options.utility, model, seed)
 
 
 def infer_utility(
     feature_sums: ArrayLike,
     pairs: Sequence[tuple[int, int]],
     *,
+    ties: Sequence[tuple[int, int]] = (),
+    shown_first: ArrayLike | None = None,
+    answerers: ArrayLike | None = None,
     features: StateFeatures | None = None,
     method: str = "posterior-mean",
     discount: float = 0.98,
     prior_scale: float = PreferenceModel.prior_scale,
-    steepness: float = PreferenceModel.steepness,
-    lapse_rate: float = PreferenceModel.lapse_rate,
+    steepness: float | None = None,
+    lapse_rate: float | None = None,
     likelihood: str = PreferenceModel.likelihood,
+    tie_threshold: float | None = None,
     seed: int = 0,
 ) -> PosteriorUtility | LinearProgramUtility:
     """The posterior without a learner, from feature sums of anything that was compared, and the answers.
 
     Args:
       feature_sums: ψ of n trajectories, or the features of n items of any kind, shape (n, D).
-      pairs: K ordered pairs (preferred, dominated) of their row numbers.
+      pairs: ordered pairs (preferred, dominated) of their row numbers.
+      ties: pairs that were answered with "no difference". There are K pairs and ties in all.
+      shown_first: as of `sample_posterior`, for the pairs and then the ties: a side bias is inferred.
+      answerers: as of `sample_posterior`: each has a lapse rate.
       features: φ, where utilities of single states are wanted too; None: the rows themselves.
       method: `posterior-mean`; `most-likely`; `posterior-draw`, one draw picked by `seed`, with directions that the
-        answers do not touch at their mean, zero; or `linear-program`.
+        answers do not touch at their mean, zero; or `linear-program`, which leaves ties out.
       discount: γ of ψ, for trajectories that the estimate is asked about later.
-      prior_scale, steepness, lapse_rate, likelihood: as of `PreferenceModel`.
+      prior_scale, steepness, lapse_rate, likelihood, tie_threshold: as of `PreferenceModel`; None: inferred.
       seed: of the sampler.
 
     Raises:
       ValueError: an unknown method, feature sums that are no finite matrix, pairs that name no row.
     """
     checks.one_of("method", method, (*POSTERIOR_METHODS, "linear-program"))
-    model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood)
-    comparisons = Comparisons((), tuple(pairs), discount)
-    return _fitted(
-        checks.matrix("feature_sums", feature_sums),
-        comparisons,
-        _as_they_are if features is None else features,
-        model,
-        method,
-        seed,
+    tied = np.arange(len(pairs) + len(ties)) >= len(pairs)
+    comparisons = Comparisons(
+        (), (*pairs, *ties), discount, Answers(tied if tied.any() else None, shown_first, answerers)
     )
+    sums = checks.matrix("feature_sums", feature_sums)
+    chosen = _as_they_are if features is None else features
+    if method == "linear-program":
+        return _by_linear_program(sums, comparisons, chosen)
+    model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold)
+    return _by_posterior([sums], np.ones((1, 0)), comparisons, chosen, method, model, seed)
 
 
-def _fitted(
-    feature_sums: np.ndarray,
+def _by_linear_program(
+    feature_sums: np.ndarray, comparisons: Comparisons, features: StateFeatures
+) -> LinearProgramUtility:
+    """Eq. 10, from ψ of the trajectories, (n, D)."""
+    checks.finite("feature_sums", feature_sums)
+    scaled, scale = normalised(comparisons.differences(feature_sums)[comparisons.ordered])
+    program = linear_program(scaled)
+    satisfied = int(np.sum(scaled @ program.weights > 0))
+    quality = FitQuality(program.converged, program.status, len(scaled), satisfied)
+    return LinearProgramUtility(features, program.weights / scale, comparisons.discount, quality, scale)
+
+
+def _by_posterior(
+    feature_sums: Sequence[np.ndarray],
+    multiples: np.ndarray,
     comparisons: Comparisons,
     features: StateFeatures,
-    model: PreferenceModel,
     method: str,
+    model: PreferenceModel,
     seed: int,
-) -> PosteriorUtility | LinearProgramUtility:
-    """The posterior or the linear program from ψ of the trajectories, (n, D)."""
-    checks.one_of("method", method, (*POSTERIOR_METHODS, "linear-program"))
-    checks.finite("feature_sums", feature_sums)
-    pairs, discount = comparisons.pairs, comparisons.discount
-    differences = pair_differences(pairs, feature_sums)
-    scaled, scale = scaled_differences(differences)
-    if method == "linear-program":
-        program = linear_program(scaled)
-        satisfied = int(np.sum(differences @ program.weights > 0))
-        quality = FitQuality(program.converged, program.status, len(pairs), satisfied)
-        return LinearProgramUtility(features, program.weights / scale, discount, quality, scale)
-    tree = posterior_draws(scaled, model, seed=seed)
-    weights = _weights(tree, method, seed) / scale
+) -> PosteriorUtility:
+    """Eqs. 7-8, from ψ of the trajectories under each setting, (n, D)."""
+    for each in feature_sums:
+        checks.finite("feature_sums", each)
+    scaled = [normalised(comparisons.differences(each)) for each in feature_sums]
+    differences, scales = np.array([each for each, _ in scaled]), np.array([scale for _, scale in scaled])
+    tree = posterior_draws(differences, model, seed=seed, answers=comparisons.answers)
+    parts = _parts(tree, method, seed)
+    margins = np.einsum("ckd,cd->k", differences, parts)
     quality = FitQuality(
         converged=bool(tree.attrs["converged"]),
         status="converged" if tree.attrs["converged"] else "the sampler did not converge within its cap of draws",
-        pairs=len(pairs),
-        pairs_satisfied=int(np.sum(differences @ weights > 0)),
+        pairs=int(comparisons.ordered.sum()),
+        pairs_satisfied=int(np.sum(margins[comparisons.ordered] > 0)),
         rhat_max=float(tree.attrs["rhat_max"]),
         effective_sample_size_min=float(tree.attrs["effective_sample_size_min"]),
         log_evidence=float(tree.attrs["log_evidence"]),
     )
-    return PosteriorUtility(features, weights, discount, quality, tree, scale)
+    return PosteriorUtility(features, multiples, scales, parts / scales[:, None], comparisons.discount, quality, tree)
 
 
-def _weights(tree: DataTree, method: str, seed: int) -> np.ndarray:
-    """The weights, shape (D,), that stand for a posterior."""
+def _parts(tree: DataTree, method: str, seed: int) -> np.ndarray:
+    """The weights of each setting, shape (C, D), that stand for a posterior: their functions' sum."""
     if method != "posterior-draw":
         return np.asarray(tree["utility_weights_" + method.removeprefix("posterior-").replace("-", "_")])
-    z = np.asarray(tree["posterior"]["coordinates"])
+    z, numbers = np.asarray(tree["posterior"]["coordinates"]), np.asarray(tree["posterior"]["setting"])
     chain, draw = np.random.default_rng([seed, 1]).integers(z.shape[:2])
-    return low_rank(np.asarray(tree["constant_data"]["differences"])).basis @ z[chain, draw]
+    parts = np.zeros(tree["utility_weights_mean"].shape)
+    basis = bases_of(tree)[numbers[chain, draw]]
+    parts[numbers[chain, draw]] = (basis @ z[chain, draw, : basis.shape[1]])[: parts.shape[1]]
+    return parts
 
 
 def _as_they_are(features: np.ndarray) -> np.ndarray:

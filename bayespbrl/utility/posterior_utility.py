@@ -1,7 +1,8 @@
-"""The posterior of the utility under one setting of the hyperparameters (paper, eqs. 7-8)."""
+"""The posterior of the utility over everything that is unknown, and the utility that is acted on (paper, eqs. 7-8)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -9,94 +10,149 @@ from xarray import DataTree
 
 from bayespbrl import checks
 from bayespbrl.features import StateFeatures
-from bayespbrl.models import PreferenceModel
-from bayespbrl.models.likelihoods import Likelihood
+from bayespbrl.models.likelihoods import Likelihood, likelihood_of
 from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
+from bayespbrl.utility.length_scales import rescaled
 from bayespbrl.utility.quality import FitQuality
+
+Table = Callable[[StateFeatures], np.ndarray]  # of the features of one setting: of states, or of trajectories
+INTERVAL = (0.05, 0.95)
 
 
 @dataclass(frozen=True)
 class PosteriorUtility:
-    """u(s′) = wᵀφ(s′) with draws of w from its posterior.
+    """u(s′) = wᵀφ(s′) with draws of w, and of the length scales of φ, from their posterior.
+
+    Mean, draws, `quality` and `likelihood` are all of that one posterior.
 
     Attributes:
-      features: φ.
-      weights: the w that is acted on (posterior mean, most likely draw or one draw), in the units of φ, shape (D,).
+      features: φ as given.
+      multiples: of its bandwidths, one row for each of C settings, shape (C, S); S = 0 for features without any.
+      scales: what the differences were divided by under each setting, shape (C,): a draw over it is in the units of φ.
+      weights: the utility that is acted on (posterior mean, most likely draw or one draw) is the sum of wᵀφ over the
+        settings, in the units of φ, shape (C, D). In a mean each setting's part has its probability in it.
       discount: γ of ψ(τ).
-      quality: how far it can be trusted.
-      posterior: draws in ArviZ's schema.
-      scale: what the differences were divided by: a draw of the posterior over `scale` is in the units of φ.
+      quality: how far the posterior can be trusted.
+      posterior: draws in ArviZ's schema, with the setting of each.
     """
 
     features: StateFeatures
+    multiples: np.ndarray
+    scales: np.ndarray
     weights: np.ndarray
     discount: float
     quality: FitQuality
     posterior: DataTree
-    scale: float = 1.0
 
-    @property
-    def sampled(self) -> "PosteriorUtility":
-        """Itself."""
-        return self
+    def likelihood(self, number: int | None = None) -> Likelihood:
+        """Of the next answer given its margin under each of S draws: margins have shape (S, n).
 
-    @property
-    def likelihood(self) -> Likelihood:
-        """Of the next answer, as a function of the difference of two utilities wᵀψ."""
-        fitted = self.posterior.attrs
-        model = PreferenceModel(
-            steepness=fitted["steepness"], lapse_rate=fitted["lapse_rate"], likelihood=fitted["likelihood"]
+        Args:
+          number: as of `trajectory_draws`.
+        """
+        drawn, fitted = self.posterior.children["posterior"].dataset, self.posterior.attrs
+        apart = slice(None, None, self._apart(number))
+        steepness, lapse_rate = (
+            drawn[name].values.reshape(*drawn["setting"].shape, -1)[:, apart, 0].reshape(-1, 1)
+            for name in ("steepness", "lapse_rate")
         )
-        return model.answer_likelihood(self.quality.pairs)
+        return likelihood_of(
+            fitted["likelihood"],
+            float(max(fitted["number_of_preferences"], 1)),
+            steepness=steepness,
+            lapse_rate=lapse_rate,
+        )
 
     def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
-        """wᵀφ(s) of n states."""
-        return linear(self.features(states), self.weights)
+        """The utility of n states."""
+        return self._drawn(_of_states(states), None)[0]
+
+    def prior_deviations(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
+        """Prior standard deviation of the utility of n states."""
+        settings = [self._setting(number)(states) / scale for number, scale in enumerate(self.scales)]
+        variances = [np.sum(features**2, axis=1) for features in settings]
+        return float(self.posterior.attrs["prior_scale"]) * np.sqrt(np.mean(variances, axis=0))
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
-        """uᵢ = wᵀφ(sᵢ′): the utility of the *next* state, the same convention as in ψ."""
+        """uᵢ: the utility of the *next* state of each transition, the same convention as in ψ."""
         return self.utilities(steps.next_states)
 
     def utilities_and_draws(
         self, states: np.ndarray, *, number: int | None = None
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
-        """`utilities` of n states and draws of them, all chains in one, from one evaluation of the features."""
-        features = self.features(states)
-        return linear(features, self.weights), self.draws(features, number=number).reshape(-1, len(states))
+        """The utility of n states and draws of it, from one evaluation of the features."""
+        return self._drawn(_of_states(states), self._apart(number))
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
         """wᵀψ(τ) of each trajectory."""
-        return linear(trajectory_features(trajectories, self.features, discount=self.discount), self.weights)
+        return self._drawn(self._of_trajectories(trajectories), None)[0]
 
     def trajectory_draws(
         self, trajectories: Sequence[Trajectory], *, number: int | None = None
     ) -> Float[np.ndarray, "s n"]:
-        """Posterior draws of wᵀψ(τ) of each trajectory, all chains in one."""
-        features = trajectory_features(trajectories, self.features, discount=self.discount)
-        return self.draws(features, number=number).reshape(-1, len(trajectories))
+        """Posterior draws of wᵀψ(τ) of each trajectory, the chains one after the other."""
+        return self._drawn(self._of_trajectories(trajectories), self._apart(number))[1]
 
     def margin_draws(self, first: Trajectory, second: Trajectory) -> Float[np.ndarray, " s"]:
         """By how much each draw prefers the first."""
         draws = self.trajectory_draws([first, second])
         return draws[:, 0] - draws[:, 1]
 
-    def draws(self, features: np.ndarray, *, number: int | None = None) -> Float[np.ndarray, "chain draw n"]:
-        """Posterior draws of wᵀφ for each row of `features`: of states, or of feature sums ψ(τ).
+    def differences(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, "c n d"]:
+        """ψ(first) − ψ of each trajectory under every setting, in the units of the posterior's differences."""
+        sums = [self._of_trajectories(trajectories)(self._setting(number)) for number in range(len(self.scales))]
+        return np.array([(each[:1] - each[1:]) / scale for each, scale in zip(sums, self.scales, strict=True)])
 
-        Args:
-          features: shape (n, D).
-          number: most draws in all, evenly spaced, but at least one a chain; None for all.
+    def hyperparameters(self) -> dict[str, Any]:
+        """Mean and 90 % interval of all that was inferred beside the weights, as plain data."""
+        drawn = self.posterior.children["posterior"].dataset
+        columns = {
+            name: drawn[name].values.reshape(drawn["setting"].size, -1)[:, 0]
+            for name in ("lapse_rate", "steepness", "tie_threshold", "side_bias")
+            if name in drawn
+        }
+        figures: dict[str, Any] = {name: float(values.mean()) for name, values in columns.items()}
+        figures |= {
+            f"{name} {'lower' if quantile < 0.5 else 'upper'}": float(np.quantile(values, quantile))
+            for name, values in columns.items()
+            for quantile in INTERVAL
+        }
+        counts = np.bincount(drawn["setting"].values.ravel(), minlength=len(self.scales)) / drawn["setting"].size
+        return figures | {
+            "bandwidth_multiples": np.exp(counts @ np.log(self.multiples)).tolist(),
+            "most probable length scales": float(counts.max()),
+        }
 
-        Returns:
-          in the units of `weights`.
+    def _setting(self, number: int) -> StateFeatures:
+        return rescaled(self.features, self.multiples[number])
 
-        Raises:
-          ValueError: features of another length, or a number < 1.
-        """
-        if features.ndim != 2 or features.shape[1] != len(self.weights):
-            raise ValueError(f"features: expected shape (n, {len(self.weights)}), got {features.shape}")
-        weights = self.posterior.children["posterior"].to_dataset()["utility_weights"]
-        return weights[:, :: spacing(weights.shape[0] * weights.shape[1], number)].values @ features.T / self.scale
+    def _apart(self, number: int | None) -> int:
+        setting = self.posterior.children["posterior"].dataset["setting"]
+        return spacing(setting.size, number)
+
+    def _of_trajectories(self, trajectories: Sequence[Trajectory]) -> Table:
+        return lambda features: trajectory_features(trajectories, features, discount=self.discount)
+
+    def _drawn(self, table: Table, apart: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """The utility of each of n rows of `table`, (n,), and every `apart`-th draw of it, (S, n); None: no draws."""
+        drawn = self.posterior.children["posterior"].dataset
+        every = slice(0, 0) if apart is None else slice(None, None, apart)
+        settings, weights = drawn["setting"].values[:, every], drawn["utility_weights"][:, every].values
+        mean, draws = np.zeros(0), np.zeros((*settings.shape, 0))
+        for number, part in enumerate(self.weights):
+            chosen = settings == number
+            if not chosen.any() and not part.any() and number > 0:
+                continue
+            features = table(self._setting(number))
+            if number == 0:
+                mean, draws = np.zeros(len(features)), np.empty((*settings.shape, len(features)))
+            mean += linear(features, part)
+            draws[chosen] = weights[chosen] @ features.T / self.scales[number]
+        return mean, draws.reshape(-1, draws.shape[2])
+
+
+def _of_states(states: np.ndarray) -> Table:
+    return lambda features: features(states)
 
 
 def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " n"]:

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from gymnasium.experimental.functional import FuncEnv
 
-from bayespbrl.diagnostics.estimates import first_preferred_probability, of_states, one_setting, sampled
+from bayespbrl.diagnostics.estimates import first_preferred_probability, number_of_features, of_states
 from bayespbrl.diagnostics.predictions import fitted_model
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
@@ -67,9 +67,8 @@ class RunContents:
 
     @property
     def posterior(self) -> xr.DataTree | None:
-        """Draws of the sampled posterior; None without one."""
-        fit = sampled(self.estimate)
-        return None if fit is None else fit.posterior
+        """Draws of the posterior; None without one."""
+        return None if self.estimate is None else self.estimate.posterior
 
     @property
     def without_posterior(self) -> bool:
@@ -163,7 +162,7 @@ def _features_failure(contents: RunContents, features: StateFeatures | None, tra
         width = checked_features(features, trajectory.states).shape[1]
     except Exception as error:  # a function of the user's may raise anything
         return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
-    expected = len(one_setting(contents.estimate).weights)
+    expected = number_of_features(contents.estimate)
     return "" if width == expected else f"the one that was passed has {width} features, the run's {expected}"
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ranks
-from bayespbrl.diagnostics.estimates import expect_sampled, of_states
+from bayespbrl.diagnostics.estimates import of_states
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.prequential import plot_calibration
 from bayespbrl.diagnostics.report import figures
@@ -151,7 +151,7 @@ def updates(iterations: xr.Dataset) -> Body:
             "temperature and the effective samples of REPS are those of the last."
         )
     blocks: list[Block] = [drawn("updates", panels, caption, "KL, temperature, entropy and effective samples.")]
-    for group, label in (("schedule", "Schedule of the KL bound"), ("hyperparameters", "Choice of hyperparameters")):
+    for group, label in (("schedule", "Schedule of the KL bound"), ("hyperparameters", "What was inferred beside the weights")):
         blocks += _reported(iterations, group, label)
     return [], blocks
 
@@ -178,11 +178,11 @@ def _by_iteration(iterations: xr.Dataset, columns: Mapping[str, str], caption: s
 
 
 def sensitivity_to_model(contents: RunContents) -> Body:
-    """Sensitivity to the prior scale σ and to the likelihood, whose steepness is m."""
+    """Sensitivity to the prior scale σ and to the likelihood."""
     if contents.posterior is None:
         return [contents.posterior_missing], []
     try:
-        result = sensitivity(thinned(expect_sampled(contents.estimate), SENSITIVITY_DRAWS).posterior)
+        result = sensitivity(thinned(contents.posterior, SENSITIVITY_DRAWS))
     except ValueError as error:  # ArviZ cannot smooth a tail of equal weights
         few = "This happens while there are few answers and most draws explain them equally well."
         return [f"The sensitivity cannot be estimated ({error}). {few}"], []
@@ -193,8 +193,7 @@ def sensitivity_to_model(contents: RunContents) -> Body:
     above = {part: int((result["sensitivity"].sel(component=part) >= limit).sum()) for part in ("prior", "likelihood")}
     text = [
         f"Of {total} margins, {above['prior']} are sensitive (at least {limit:g}) to the prior scale σ = "
-        f"{contents.model.prior_scale:g}, and {above['likelihood']} to the likelihood, whose steepness is m = "
-        f"{contents.model.steepness:g}.",
+        f"{contents.model.prior_scale:g}, and {above['likelihood']} to the likelihood.",
         "A margin is sensitive to the prior where the answers leave its size open: they say which trajectory is "
         "better, seldom by how much. Its sign, which fixes the order of the trajectories, can still be certain.",
     ]

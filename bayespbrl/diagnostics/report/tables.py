@@ -7,14 +7,14 @@ import numpy as np
 import xarray as xr
 from gymnasium.spaces import Discrete
 
-from bayespbrl.diagnostics.estimates import expect_estimate, is_average, of_states, one_setting, sampled
+from bayespbrl.diagnostics.estimates import expect_estimate, of_states
 from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary
 from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws
-from bayespbrl.models.likelihoods import prob
 from bayespbrl.preferences import Answer
 from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility import PosteriorUtility
 
 MEASURED = (
     *("answers", "pairs", "pairs_satisfied", "value", "kl_bound", "bound_active", "kl", "kl_fitted_policy", "updates"),
@@ -79,17 +79,14 @@ def _by_last_estimate(contents: RunContents, answer: AnsweredQuestion) -> tuple[
     if estimate is None or answer.row is None or answer.row >= estimate.quality.pairs:
         return np.nan, np.nan, np.nan
     both = _preferred_and_dominated(contents, answer)
-    if tree is not None and not is_average(estimate):
+    if tree is not None:
         margins = np.asarray(tree["posterior"]["margins"])[:, :, answer.row]
         probability = np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row]))
     elif both is None:
         return np.nan, np.nan, np.nan
-    elif tree is None:
+    else:
         preferred, dominated = estimate.trajectory_utilities(both)
         return np.nan, float(preferred - dominated), np.nan
-    else:
-        margins = estimate.margin_draws(*both)
-        probability = np.mean(prob(estimate.likelihood, margins))
     return float(probability), float(margins.mean()), float(margins.std())
 
 
@@ -108,9 +105,8 @@ def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
     """The utility over the state space.
 
     Returns:
-      along `state`: `used`, the utility that the learner used (of an average the average, while all else is of its
-      sampled setting); where there is a posterior, its `mean` and `sd`, `prior_sd`, and `draws` (draw, state), three of
-      them; all in the units of the weights; `states`, the observations; `visits`, how often each was seen (discrete
+      along `state`: `used`, the utility that the learner used; where there is a posterior, its `mean` and `sd`,
+      `prior_sd`, and `draws` (draw, state), three of them; `states`, the observations; `visits`, how often each was seen (discrete
       states); `reached`, whether φ is more than a hundredth of its largest length, as it is near some centre.
 
       The attribute `kind` says what the states are: `grid` (the cells, row by row, of an environment with a
@@ -128,21 +124,18 @@ def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
         raise ValueError("utility: expected an estimate of the utility of states, got none")
     states = np.concatenate([trajectory.states for trajectory in contents.trajectories.values()])
     shown, attrs = _states_to_show(contents, states, np.random.default_rng(seed))
-    features = one_setting(estimate).features(shown)
-    lengths = np.linalg.norm(features, axis=1)
+    lengths = np.linalg.norm(estimate.features(shown), axis=1)
     data: Variables = {"used": ("state", estimate.utilities(shown))}
     data["reached"] = ("state", lengths > 0.01 * np.max(lengths, initial=0.0))
     data["states"] = (("state",) if shown.ndim == 1 else ("state", "observation"), shown)
     if states.ndim == 1:
         data["visits"] = ("state", np.bincount(states, minlength=len(shown)))
-    if (fit := sampled(estimate)) is not None:
-        draws = fit.draws(features, number=DRAWS).reshape(-1, len(shown))
+    if isinstance(estimate, PosteriorUtility):
+        _, draws = estimate.utilities_and_draws(shown, number=DRAWS)
         chosen = np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)
-        mean = np.asarray(fit.posterior["utility_weights_mean"]) / fit.scale
-        data["mean"], data["sd"] = ("state", features @ mean), ("state", draws.std(axis=0))
+        data["mean"], data["sd"] = ("state", draws.mean(axis=0)), ("state", draws.std(axis=0))
         data["draws"] = (("draw", "state"), draws[chosen])
-        scale = float(fit.posterior.attrs["prior_scale"]) / fit.scale
-        data["prior_sd"] = ("state", scale * lengths)
+        data["prior_sd"] = ("state", estimate.prior_deviations(shown))
     return xr.Dataset(data, attrs=attrs)
 
 

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.diagnostics.estimates import is_average, of_states
+from bayespbrl.diagnostics.estimates import of_states
 from bayespbrl.diagnostics.report import figures
 from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.document import Block, Body, Picture, drawn
-from bayespbrl.diagnostics.report.formatting import percent
+from bayespbrl.diagnostics.report.formatting import number, percent
 from bayespbrl.diagnostics.report.tables import trajectories_table, utility_table
 from bayespbrl.diagnostics.uncertainty import plot_ranking
+from bayespbrl.utility import PosteriorUtility
 
 PLACES = {
     "grid": "over the cells of the grid",
@@ -32,13 +33,8 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
         return [f"The features φ are a function of your own, and {contents.features_missing}."], []
     blocks: list[Block] = []
     text = [] if contents.posterior is not None else [contents.posterior_missing]
-    if is_average(estimate):
-        text.append(
-            f"The learner acted on an average over {len(estimate.probabilities)} choices of length scales; the most "
-            f"probable has probability {percent(estimate.probabilities.max())}. The average orders the trajectories "
-            "below and gives the answers their probabilities. The mean, the deviation and the draws over the states, "
-            "the convergence and the sensitivity are those of the one setting whose posterior was sampled."
-        )
+    if isinstance(estimate, PosteriorUtility):
+        text.append(_what_else(estimate))
     if of_states(estimate):
         table = utility_table(contents)
         blocks += _maps(table)
@@ -55,6 +51,26 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
         panels = [("Ranking", partial(plot_ranking, ranking))]
         blocks.append(drawn("ranking", panels, caption, alt, size=(6.0, 3.6)))
     return text, blocks
+
+
+def _what_else(estimate: PosteriorUtility) -> str:
+    """What the posterior says of all but the weights, in words."""
+    found = estimate.hyperparameters()
+
+    def inferred(name: str) -> str:
+        low, high = (found[f"{name} {end}"] for end in ("lower", "upper"))
+        return f"{number(found[name])}" if low == high else f"{number(found[name])} ({number(low)} to {number(high)})"
+
+    text = f"Lapse rate: {inferred('lapse_rate')}, steepness: {inferred('steepness')}"
+    for name, label in (("tie_threshold", "tie threshold"), ("side_bias", "side bias")):
+        text += f", {label}: {inferred(name)}" if name in found else ""
+    text += ", with 90 % intervals where they are inferred."
+    if len(estimate.scales) > 1:
+        text += (
+            f" The posterior is over {len(estimate.scales)} choices of length scales as well; the most probable has "
+            f"probability {percent(found['most probable length scales'])}, a priori {percent(1 / len(estimate.scales))}."
+        )
+    return text
 
 
 def _remaining_uncertainty(table: xr.Dataset) -> list[str]:

@@ -45,8 +45,8 @@ def _of_fits(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarning
         yield ReportWarning(
             f"The posterior did not converge in {_which(failed)}. {last}Uncertainties there are unreliable, and so are "
             "the policy updates that followed.",
-            "Look at the rank plots. The usual reason is answers that contradict each other. A lapse rate above zero "
-            "(--lapse-rate 0.1) or a lower --steepness softens them.",
+            "Look at the rank plots. The usual reason is answers that contradict each other, under a lapse rate that was "
+            "set to zero: leave it to be inferred.",
         )
 
 
@@ -115,9 +115,8 @@ def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWa
     if (against := question[answers["margin"].values < 0]).size:
         yield ReportWarning(
             f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
-            "See the pictures below. If these answers are mistakes, allow for them with --lapse-rate 0.1 (now "
-            f"{contents.model.lapse_rate:g}). If they are right, the features cannot express what matters: use "
-            "more centres or features of your own.",
+            "See the pictures below. If these answers are mistakes, the lapse rate allows for them, unless it is set. If "
+            "they are right, the features cannot express what matters: use more centres or features of your own.",
         )
     if (surprising := question[answers["before"].values < SURPRISING]).size:
         yield ReportWarning(
@@ -129,7 +128,7 @@ def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWa
     ties = sum(answer.answer is Answer.TIE for answer in contents.answers)
     if ties > 0.3 * max(3, len(contents.answers)):
         yield ReportWarning(
-            f"{ties} of {len(contents.answers)} answers were ties, from which the posterior learns nothing.",
+            f"{ties} of {len(contents.answers)} answers were ties, from which the posterior learns little.",
             "Longer or more different trajectories are easier to tell apart.",
         )
 
@@ -140,7 +139,8 @@ def _of_predictions(scores: xr.Dataset) -> Iterator[ReportWarning]:
         yield ReportWarning(
             "The predictions were overconfident: their log score is more than two standard deviations below its "
             "expectation.",
-            "A lapse rate, a lower --steepness or smoother features make them less certain.",
+            "Leave length scales, lapse rate and steepness to be inferred (--hyperparameters inferred), if they were set. "
+            "Else the features cannot express what matters.",
         )
 
 

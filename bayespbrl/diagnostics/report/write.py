@@ -131,8 +131,8 @@ def _facts(contents: RunContents) -> list[tuple[str, str]]:
     return [
         ("likelihood", settings.model.likelihood),
         ("prior scale σ", f"{model.prior_scale:g}"),
-        ("steepness m", f"{model.steepness:g}"),
-        ("lapse rate λ", f"{model.lapse_rate:g}"),
+        ("steepness m", "inferred" if model.steepness is None else f"{model.steepness:g}"),
+        ("lapse rate λ", "inferred" if model.lapse_rate is None else f"{model.lapse_rate:g}"),
         ("KL bound ε", f"{settings.update.kl_bound:g}"),
         ("most updates per iteration", str(settings.update.updates_per_iteration)),
         ("most iterations in a row without a question", str(settings.questions.unasked_iterations)),

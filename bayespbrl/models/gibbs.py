@@ -1,0 +1,136 @@
+"""Gibbs moves over all that is not a weight: the setting of the features, steepness, lapse rates and tie threshold.
+
+Steepness, lapse rates and threshold have a prior on a grid, and given the margins each is drawn exactly from its
+conditional distribution. The setting (length scales) is drawn given the *whitened* weights ξ, z = m + A ξ, with the
+Gaussian reference (m, A) of each setting: ξ means nearly the same under every setting, so that the move goes far. As
+the weights change with it, its probabilities carry the volume |A| (reversible jump with a deterministic map; Green
+1995). Between these moves the weights are sampled by elliptical slices.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, random
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from bayespbrl.models.likelihoods import Likelihood, Margins, Values, WithLapses, WithTies, log_prob
+from bayespbrl.models.preference_problem import PreferenceProblem
+
+STACKED = ("loadings", "used", "centre", "site_precisions", "root", "inverse_root")
+
+
+class Table(NamedTuple):
+    """A prior on a grid, for JAX."""
+
+    values: Float[Array, " v"]
+    log_probabilities: Float[Array, " v"]
+
+
+class JointProblem(NamedTuple):
+    """All that is given.
+
+    Attributes:
+      settings: one problem for each of C settings, stacked.
+      log_probabilities: of the settings, a priori.
+      steepness, lapse_rate, tie_threshold: priors.
+      answerers: who gave each answer, one-hot; zero in padded rows.
+    """
+
+    settings: PreferenceProblem
+    log_probabilities: Float[Array, " s"]
+    steepness: Table
+    lapse_rate: Table
+    tie_threshold: Table
+    answerers: Float[Array, "a c"]
+
+
+class Unknowns(NamedTuple):
+    """What is sampled beside the weights: numbers of the setting and of the grids' values."""
+
+    setting: Int[Array, "*chains"]
+    steepness: Int[Array, "*chains"]
+    lapse_rate: Int[Array, "*chains a"]
+    tie_threshold: Int[Array, "*chains"]
+
+
+class _Point(NamedTuple):
+    """The values of the unknowns; of λ one for each answer, zero in padded rows."""
+
+    steepness: Values
+    lapse_rate: Values
+    tie_threshold: Values
+
+
+def _point(problem: JointProblem, unknowns: Unknowns) -> _Point:
+    return _Point(
+        problem.steepness.values[unknowns.steepness],
+        problem.lapse_rate.values[unknowns.lapse_rate] @ problem.answerers,
+        problem.tie_threshold.values[unknowns.tie_threshold],
+    )
+
+
+def conditional(problem: JointProblem, unknowns: Unknowns) -> PreferenceProblem:
+    """The problem of the weights given all else."""
+    parts = {name: getattr(problem.settings, name)[unknowns.setting] for name in STACKED}
+    return problem.settings._replace(likelihood=_likelihood(problem, _point(problem, unknowns)), **parts)
+
+
+def moved(
+    key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem
+) -> tuple[Float[Array, " q"], Unknowns]:
+    """New weights and unknowns after one move of each kind; what is given has none."""
+    keys = random.split(key, 4)
+    if len(problem.log_probabilities) > 1:
+        z, unknowns = _setting_move(keys[0], z, unknowns, problem)
+    margins = problem.settings.loadings[unknowns.setting] @ z
+    for key, name in zip(keys[1:], ("steepness", "lapse_rate", "tie_threshold"), strict=True):
+        prior: Table = getattr(problem, name)
+        if len(prior.values) > 1:
+            every = _point(problem, unknowns)._replace(**{name: prior.values[:, None]})
+            log_p = _log_probabilities(problem, every, margins)
+            # each answerer's lapse rate is drawn from the answers of that one, all else from all answers
+            log_p = problem.answerers @ log_p.T if name == "lapse_rate" else log_p.sum(axis=1)
+            unknowns = unknowns._replace(**{name: random.categorical(key, log_p + prior.log_probabilities)})
+    return z, unknowns
+
+
+def _setting_move(
+    key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem
+) -> tuple[Float[Array, " q"], Unknowns]:
+    """A setting drawn from its distribution given the whitened weights, and the weights under it."""
+    settings, now = problem.settings, unknowns.setting
+    whitened = settings.inverse_root[now] @ (z - settings.centre[now])
+    points = settings.centre + settings.root @ whitened
+    margins = jnp.einsum("skq,sq->sk", settings.loadings, points)
+    log_p = jnp.sum(_log_probabilities(problem, _point(problem, unknowns), margins), axis=1)
+    log_p -= 0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # log N(z; 0, σ²I)
+    log_p += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A|
+    setting = random.categorical(key, log_p + problem.log_probabilities)
+    return points[setting], unknowns._replace(setting=setting)
+
+
+def _log_probabilities(problem: JointProblem, point: _Point, margins: Margins) -> Values:
+    """log p of each answer, 0 in padded rows."""
+    real = problem.answerers.sum(axis=0) > 0
+    return jnp.where(real, log_prob(_likelihood(problem, point), margins), 0)
+
+
+def _likelihood(problem: JointProblem, point: _Point) -> Likelihood:
+    return _with_values(problem.settings.likelihood, point)
+
+
+def _with_values(template: Likelihood, point: _Point) -> Likelihood:
+    """The likelihood with other values in it."""
+    if isinstance(template, WithTies):
+        return replace(template, ordered=_with_values(template.ordered, point), threshold=point.tie_threshold)
+    if isinstance(template, WithLapses):
+        return replace(template, attentive=_with_values(template.attentive, point), lapse_rate=point.lapse_rate)
+    return replace(template, steepness=point.steepness)
+
+
+def stacked(problems: Sequence[PreferenceProblem]) -> PreferenceProblem:
+    """Problems of one capacity as one with a leading axis; likelihood and prior scale are the first's."""
+    arrays = {name: jnp.stack([getattr(each, name) for each in problems]) for name in STACKED}
+    return problems[0]._replace(**arrays)
