@@ -25,7 +25,6 @@ import jax
 from bayespbrl import Learner, ReturnExpert, features, models, policies, rollouts, trajectories
 from bayespbrl.improvement import lstd, reps
 from bayespbrl.policies import batch, hyperparameter_search
-from bayespbrl.utility import hyperparameters
 
 FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
     "features": (
@@ -34,7 +33,6 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], ...]] = {
         trajectories.trajectory_features,
     ),
     "sampler": (models.posterior_draws,),
-    "hyperparameters": (hyperparameters.choose_hyperparameters,),
     "linear program": (models.linear_program,),
     "LSTD": (lstd.transition_sums, lstd.solve_lstd),
     "dual": (reps.reps_weights, reps.reps_weights_by_state),

@@ -4,13 +4,13 @@ Eq. 8 depends on the number of preferences K. Decision: each refit keeps the K o
 one model: the log probabilities of the answers, each given those before it, sum to its log marginal likelihood.
 """
 
-from dataclasses import fields, replace
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from bayespbrl import checks
-from bayespbrl.models import Answers, PreferenceModel, posterior_draws
+from bayespbrl.models import NOTHING_ELSE, Answers, PreferenceModel, posterior_draws
 from bayespbrl.models.likelihoods import likelihood_of, smoothed_probability
 from bayespbrl.models.posterior import SamplerOptions
 from bayespbrl.models.posterior_tree import answers_of, bases_of, settings_of
@@ -81,7 +81,7 @@ def held_out_probabilities(
     used: np.ndarray,
     asked: np.ndarray,
     *,
-    answers: Answers = Answers(),
+    answers: Answers = NOTHING_ELSE,
     number_of_preferences: int | None = None,
     **sampling_options: int,
 ) -> tuple[np.ndarray, bool]:
@@ -115,8 +115,10 @@ def refit(tree: xr.DataTree, used: np.ndarray, **sampling_options: int) -> xr.Da
 
 def fitted_model(tree: xr.DataTree) -> PreferenceModel:
     """The model that a tree's draws are from."""
-    options = {field.name: tree.attrs[field.name] for field in fields(PreferenceModel)}
-    return PreferenceModel(**{name: None if x != x else x for name, x in options.items()})  # NaN: inferred
+    options: dict[str, Any] = {field.name: tree.attrs[field.name] for field in fields(PreferenceModel)}
+    for name, value in options.items():
+        options[name] = None if value != value else value  # NaN: inferred
+    return PreferenceModel(**options)
 
 
 def number_of_preferences(tree: xr.DataTree) -> int:

@@ -11,7 +11,7 @@ from scipy.special import xlog1py, xlogy
 
 from bayespbrl import checks
 from bayespbrl.diagnostics import predictions
-from bayespbrl.models import Answers, PreferenceModel
+from bayespbrl.models import NOTHING_ELSE, Answers, PreferenceModel
 from bayespbrl.models.posterior_tree import answers_of, settings_of
 
 
@@ -21,7 +21,7 @@ def prequential_predictions(
     model: PreferenceModel | None = None,
     *,
     groups: np.ndarray | None = None,
-    answers: Answers = Answers(),
+    answers: Answers = NOTHING_ELSE,
     **sampling_options: int,
 ) -> np.ndarray:
     """Probability that the first shown is preferred, for each answer by an exact refit to the answers before it.
@@ -88,14 +88,19 @@ def calibration(
     number, tied = differences.shape[-2], predictions.tied_rows(tree)
     order = "drawn" if first_preferred is None else "given"
     if first_preferred is None:
-        first_preferred = np.random.default_rng(seed).random(number) < 0.5
+        first_preferred = np.asarray(np.random.default_rng(seed).random(number) < 0.5)
     first_preferred = checks.flags("first_preferred", first_preferred, number)
     groups = predictions.answer_groups(groups, number)
     if predicted is None:
         options = {"seed": int(tree.attrs["seed"]), "number_of_preferences": predictions.number_of_preferences(tree)}
         options |= sampling_options
         predicted = prequential_predictions(
-            differences, first_preferred, predictions.fitted_model(tree), groups=groups, answers=answers_of(tree), **options
+            differences,
+            first_preferred,
+            predictions.fitted_model(tree),
+            groups=groups,
+            answers=answers_of(tree),
+            **options,
         )
     predicted = np.asarray(predicted, dtype=np.float64)
     if predicted.shape != (number,):

@@ -90,9 +90,7 @@ def ranking_probabilities(returns: xr.Dataset) -> xr.Dataset:
     )
 
 
-def q_draws(
-    learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: int = 200, seed: int = 0
-) -> xr.Dataset:
+def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: int = 200, seed: int = 0) -> xr.Dataset:
     """Posterior draws of Q(s, a) under the learner's policy, for each pair of the given states and actions.
 
     LSTD-Q once, with the utility of each draw as a column, from all transitions of the learner. The state-action

@@ -20,9 +20,10 @@ from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian
 from bayespbrl.models.linear_program import LinearProgramResult, linear_program
 from bayespbrl.models.posterior import posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import restored, stored
-from bayespbrl.models.preference_model import Answers, PreferenceModel, preference_model
+from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel, preference_model
 
 __all__ = [
+    "NOTHING_ELSE",
     "Answers",
     "EllipticalSlice",
     "GaussianFit",

@@ -81,7 +81,9 @@ class Chains:
 
         def drawn(prior: Table, *shape: int) -> Int[Array, "..."]:
             probabilities = np.exp(np.asarray(prior.log_probabilities))
-            return jnp.asarray(rng.choice(len(prior.values), (num_chains, *shape), p=probabilities / probabilities.sum()))
+            return jnp.asarray(
+                rng.choice(len(prior.values), (num_chains, *shape), p=probabilities / probabilities.sum())
+            )
 
         unknowns = Unknowns(
             jnp.asarray(setting),
@@ -174,9 +176,7 @@ def _log_likelihood(z: Values, model_args: Args, model_kwargs: Keywords) -> Floa
 
 # numpyro.infer.MCMC would compile this kernel anew on every run; `draw_chunk` compiles once for each capacity.
 KERNEL, KERNEL_OF_SWEEP = (
-    EllipticalSlice(
-        low_rank_model, batch=8, ellipses=partial(_ellipses, sweeps=sweeps), log_likelihood=_log_likelihood
-    )
+    EllipticalSlice(low_rank_model, batch=8, ellipses=partial(_ellipses, sweeps=sweeps), log_likelihood=_log_likelihood)
     for sweeps in (1, SWEEPS)
 )
 Recorded = tuple[EllipticalSliceState, Unknowns, Float[Array, "*draws k"]]

@@ -51,9 +51,7 @@ def _bridged(
     for _ in range(ITERATIONS):
         above = proposal - np.logaddexp(log_share + proposal, log_rest + estimate)
         below = -np.logaddexp(log_share + posterior, log_rest + estimate)
-        estimate = float(
-            logsumexp(above) - np.log(len(proposal)) - logsumexp(below) + np.log(len(posterior))
-        )
+        estimate = float(logsumexp(above) - np.log(len(proposal)) - logsumexp(below) + np.log(len(posterior)))
     errors = [
         np.var(values) / np.mean(values) ** 2 / size
         for values, size in ((np.exp(above - above.max()), number), (np.exp(below - below.max()), effective))

@@ -9,7 +9,7 @@ the weights change with it, its probabilities carry the volume |A| (reversible j
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, random
@@ -118,10 +118,11 @@ def _log_probabilities(problem: JointProblem, point: _Point, margins: Margins) -
 
 
 def _likelihood(problem: JointProblem, point: _Point) -> Likelihood:
-    return _with_values(problem.settings.likelihood, point)
+    likelihood: Likelihood = _with_values(problem.settings.likelihood, point)
+    return likelihood
 
 
-def _with_values(template: Likelihood, point: _Point) -> Likelihood:
+def _with_values(template: Any, point: _Point) -> Any:
     """The likelihood with other values in it."""
     if isinstance(template, WithTies):
         return replace(template, ordered=_with_values(template.ordered, point), threshold=point.tie_threshold)
@@ -132,5 +133,5 @@ def _with_values(template: Likelihood, point: _Point) -> Likelihood:
 
 def stacked(problems: Sequence[PreferenceProblem]) -> PreferenceProblem:
     """Problems of one capacity as one with a leading axis; likelihood and prior scale are the first's."""
-    arrays = {name: jnp.stack([getattr(each, name) for each in problems]) for name in STACKED}
+    arrays: dict[str, Any] = {name: jnp.stack([getattr(each, name) for each in problems]) for name in STACKED}
     return problems[0]._replace(**arrays)

@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import ndtr
 
 LIKELIHOODS = ("mixed", "logistic", "probit")  # names of those that have neither lapses nor ties
-Scalar = float | Float[Array, ""]  # a number, or what JAX makes of it where it traces a function
-Values = Float[Array, "*b k"]  # one for each margin
-Margins = Values | Float[np.ndarray, "*b k"]
+Values = Float[Array, "..."]  # one for each margin, and for each value of a parameter
+# a number, or what JAX makes of it where it traces a function, or an array that broadcasts against the margins
+Scalar = float | Float[Array, "..."] | Float[np.ndarray, "..."]
+Margins = Float[Array, "*b k"] | Float[np.ndarray, "*b k"]
 
 
 class ProbitMixture(NamedTuple):
@@ -206,7 +207,7 @@ class WithTies:
 
     ordered: Mixed | Logistic | Probit | WithLapses
     threshold: Scalar
-    indifferent: Bool[Array, " k"] | Bool[np.ndarray, " k"]
+    indifferent: Bool[Array, "*b k"] | Bool[np.ndarray, "*b k"]
 
     def factor(self, margins: Margins) -> tuple[Values, Values]:
         """q = 1: the logarithms of both terms of a tie are needed."""
@@ -233,10 +234,10 @@ def likelihood_of(
     name: str,
     number_of_preferences: float,
     *,
-    steepness: Scalar | Values,
-    lapse_rate: Scalar | Values | None = None,
-    tie_threshold: Scalar | Values | None = None,
-    indifferent: Bool[Array, " k"] | Bool[np.ndarray, " k"] | bool = False,
+    steepness: Scalar,
+    lapse_rate: Scalar | None = None,
+    tie_threshold: Scalar | None = None,
+    indifferent: Bool[Array, " k"] | Bool[np.ndarray, " k"] | None = None,
 ) -> Likelihood:
     """The likelihood `name` with these values: numbers, or arrays that broadcast against the margins.
 
@@ -255,7 +256,11 @@ def likelihood_of(
         ordered = (Logistic if name == "logistic" else Probit)(steepness)
     if lapse_rate is not None:
         ordered = WithLapses(ordered, lapse_rate)
-    return ordered if tie_threshold is None else WithTies(ordered, tie_threshold, indifferent)
+    return (
+        ordered
+        if tie_threshold is None
+        else WithTies(ordered, tie_threshold, np.zeros(0, bool) if indifferent is None else indifferent)
+    )
 
 
 def smoothed_probability(

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 
 from bayespbrl import checks
 from bayespbrl.models.chains import CHUNK, Chains
-from bayespbrl.models.convergence import Convergence, chain_convergence
+from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.evidence import log_evidence
 from bayespbrl.models.gaussian_fit import fit_gaussian, one_blas_thread
 from bayespbrl.models.posterior_tree import margins_of, posterior_tree, settings_of
-from bayespbrl.models.preference_model import Answers, PreferenceModel
+from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
 
 # A setting that fewer draws have is not diagnosed: how many do is known too badly, and matters little.
 LEAST_SHARE = 0.05
@@ -115,7 +115,7 @@ def posterior_draws(
     model: PreferenceModel,
     *,
     seed: int,
-    answers: Answers = Answers(),
+    answers: Answers = NOTHING_ELSE,
     number_of_preferences: int | None = None,
     sampler: SamplerOptions | None = None,
 ) -> xr.DataTree:
@@ -125,15 +125,17 @@ def posterior_draws(
     settings = settings_of(differences)
     answers = answers.checked(settings.shape[1])
     number = settings.shape[1] if number_of_preferences is None else number_of_preferences
-    options = {"indifferent": answers.indifferent, "number_of_preferences": number}
-    fits = [fit_gaussian(each, model, **options) for each in answers.with_sides(settings, model.prior_scale)]
+    fits = [
+        fit_gaussian(each, model, indifferent=answers.indifferent, number_of_preferences=number)
+        for each in answers.with_sides(settings, model.prior_scale)
+    ]
     with jax.enable_x64(True), one_blas_thread():
         chains = Chains.start(
             fits,
             num_chains=sampler.num_chains,
             chunk=min(sampler.num_samples, CHUNK),
             seed=seed,
-            answerers=answers.answerers,
+            answerers=None if answers.answerers is None else np.asarray(answers.answerers),
         )
         chains = replace(chains.extended(sampler.num_warmup), draws=())
         wanted = sampler.num_samples
@@ -144,8 +146,12 @@ def posterior_draws(
                 break
             wanted *= 2
         evidence = log_evidence(chains, wanted, seed=seed)
-    attributes = {"number_of_preferences": int(number), "seed": seed}
-    attributes |= dict(zip(("log_evidence", "log_evidence_error"), evidence, strict=True))
+    attributes = {
+        "number_of_preferences": int(number),
+        "seed": seed,
+        "log_evidence": evidence[0],
+        "log_evidence_error": evidence[1],
+    }
     return posterior_tree(fits, chains, wanted, report, attributes, np.asarray(differences), answers)
 
 

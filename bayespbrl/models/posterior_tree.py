@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -107,7 +106,7 @@ def answers_of(tree: xr.DataTree) -> Answers:
 
 def bases_of(tree: xr.DataTree) -> list[Float[np.ndarray, "d r"]]:
     """Q of each setting, of the features and, where there is one, the side."""
-    settings = settings_of(tree.children["constant_data"]["differences"].values)
+    settings = settings_of(tree.children["constant_data"].dataset["differences"].values)
     augmented = answers_of(tree).with_sides(settings, float(tree.attrs["prior_scale"]))
     return [low_rank(each).basis for each in augmented]
 
@@ -115,14 +114,16 @@ def bases_of(tree: xr.DataTree) -> list[Float[np.ndarray, "d r"]]:
 def stored(tree: xr.DataTree) -> xr.DataTree:
     """The tree without what `restored` computes, to write to disk."""
     posterior = tree.children["posterior"].to_dataset(inherit=False)
-    return _replaced(tree, posterior.drop_vars(["utility_weights", "side_bias"], errors="ignore"), xr.Dataset(attrs=tree.attrs))
+    return _replaced(
+        tree, posterior.drop_vars(["utility_weights", "side_bias"], errors="ignore"), xr.Dataset(attrs=tree.attrs)
+    )
 
 
 def restored(tree: xr.DataTree) -> xr.DataTree:
     """The tree with `posterior["utility_weights"]`, computed where it is indexed, the side bias, and points for all."""
     bases, posterior = bases_of(tree), tree.children["posterior"].to_dataset(inherit=False)
-    z, settings, several = posterior["coordinates"].values, posterior["setting"].values, len(bases) > 1
-    differences = tree.children["constant_data"]["differences"]
+    z, settings = posterior["coordinates"].values, posterior["setting"].values
+    differences = tree.children["constant_data"].dataset["differences"]
     width, several = differences.shape[-1], differences.ndim == 3
     lazy = UtilityWeights(
         z, bases, settings, prior_scale=float(tree.attrs["prior_scale"]), seed=int(tree.attrs["seed"])
@@ -135,7 +136,7 @@ def restored(tree: xr.DataTree) -> xr.DataTree:
             rows[settings == number, : basis.shape[1]] = basis[-1]
         scale = SIDE_BIAS_SCALE / float(tree.attrs["prior_scale"])
         posterior = posterior.assign(side_bias=(SAMPLE, scale * np.sum(rows * z, axis=2)))
-    lp = tree.children["sample_stats"]["lp"].values
+    lp = tree.children["sample_stats"].dataset["lp"].values
     best = np.zeros(lp.shape, bool)
     best[np.unravel_index(np.argmax(lp), lp.shape)] = True
     points = {}
@@ -144,9 +145,7 @@ def restored(tree: xr.DataTree) -> xr.DataTree:
         for number, basis in enumerate(bases):
             chosen = settings == number
             parts[number] = (basis @ (share[chosen] @ z[chosen][:, : basis.shape[1]]))[:width]
-        points[f"utility_weights_{name}"] = (
-            (("setting", "feature"), parts) if several else (("feature",), parts[0])
-        )
+        points[f"utility_weights_{name}"] = (("setting", "feature"), parts) if several else (("feature",), parts[0])
     return _replaced(tree, posterior, xr.Dataset(points, attrs=tree.attrs))
 
 

@@ -20,7 +20,7 @@ from bayespbrl.models.priors import Grid
 class PreferenceModel:
     """Prior and likelihood (eqs. 7-8): w ~ N(0, σ²I), and the probability of an answer given its margin t = wᵀψ.
 
-    Without ties the answers depend on σ·m alone. What is None is inferred, with the priors of `bayespbrl.models.priors`.
+    Without ties the answers depend on σ·m alone. What is None is inferred, with the priors of `priors`.
 
     Attributes:
       prior_scale: σ > 0, standard deviation of each weight, in utility per feature.
@@ -119,6 +119,9 @@ class Answers:
         column = np.asarray(self.shown_first) * priors.SIDE_BIAS_SCALE / prior_scale
         column = np.broadcast_to(column[:, None], (*differences.shape[:-1], 1))
         return np.concatenate([differences, column], axis=-1)
+
+
+NOTHING_ELSE = Answers()
 
 
 def _numbers(name: str, values: ArrayLike, number: int, least: int, most: int) -> np.ndarray:

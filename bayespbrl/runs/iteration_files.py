@@ -144,5 +144,5 @@ def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Seq
         return LinearProgramUtility(features, data["weights"].values, discount, quality, float(utility.attrs["scale"]))
     groups = {name: tree.children[name] for name in POSTERIOR_GROUPS if name in tree.children}
     posterior = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
-    arrays = [data[name].values for name in ("multiples", "scales", "weights")]
-    return PosteriorUtility(features, *arrays, discount, quality, posterior)
+    multiples, scales, weights = (data[name].values for name in ("multiples", "scales", "weights"))
+    return PosteriorUtility(features, multiples, scales, weights, discount, quality, posterior)

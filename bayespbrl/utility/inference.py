@@ -11,7 +11,6 @@ from bayespbrl import checks
 from bayespbrl.features import StateFeatures
 from bayespbrl.models import Answers, PreferenceModel, linear_program, posterior_draws
 from bayespbrl.models.posterior_tree import bases_of
-from bayespbrl.preferences import pair_differences
 from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.length_scales import rescaled, settings

@@ -151,7 +151,10 @@ def updates(iterations: xr.Dataset) -> Body:
             "temperature and the effective samples of REPS are those of the last."
         )
     blocks: list[Block] = [drawn("updates", panels, caption, "KL, temperature, entropy and effective samples.")]
-    for group, label in (("schedule", "Schedule of the KL bound"), ("hyperparameters", "What was inferred beside the weights")):
+    for group, label in (
+        ("schedule", "Schedule of the KL bound"),
+        ("hyperparameters", "What was inferred beside the weights"),
+    ):
         blocks += _reported(iterations, group, label)
     return [], blocks
 

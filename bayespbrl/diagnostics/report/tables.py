@@ -106,8 +106,9 @@ def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
 
     Returns:
       along `state`: `used`, the utility that the learner used; where there is a posterior, its `mean` and `sd`,
-      `prior_sd`, and `draws` (draw, state), three of them; `states`, the observations; `visits`, how often each was seen (discrete
-      states); `reached`, whether φ is more than a hundredth of its largest length, as it is near some centre.
+      `prior_sd`, and `draws` (draw, state), three of them; `states`, the observations; `visits`, how often each was
+      seen (discrete states); `reached`, whether φ is more than a hundredth of its largest length, as it is near some
+      centre.
 
       The attribute `kind` says what the states are: `grid` (the cells, row by row, of an environment with a
       `grid_shape`), `list` (discrete), `line` and `plane` (evenly spaced over what was observed in one or two

@@ -68,7 +68,8 @@ def _what_else(estimate: PosteriorUtility) -> str:
     if len(estimate.scales) > 1:
         text += (
             f" The posterior is over {len(estimate.scales)} choices of length scales as well; the most probable has "
-            f"probability {percent(found['most probable length scales'])}, a priori {percent(1 / len(estimate.scales))}."
+            f"probability {percent(found['most probable length scales'])}, a priori "
+            f"{percent(1 / len(estimate.scales))}."
         )
     return text
 

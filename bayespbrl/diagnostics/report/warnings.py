@@ -45,8 +45,8 @@ def _of_fits(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarning
         yield ReportWarning(
             f"The posterior did not converge in {_which(failed)}. {last}Uncertainties there are unreliable, and so are "
             "the policy updates that followed.",
-            "Look at the rank plots. The usual reason is answers that contradict each other, under a lapse rate that was "
-            "set to zero: leave it to be inferred.",
+            "Look at the rank plots. The usual reason is answers that contradict each other, under a lapse rate that "
+            "was set to zero: leave it to be inferred.",
         )
 
 
@@ -115,8 +115,8 @@ def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWa
     if (against := question[answers["margin"].values < 0]).size:
         yield ReportWarning(
             f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
-            "See the pictures below. If these answers are mistakes, the lapse rate allows for them, unless it is set. If "
-            "they are right, the features cannot express what matters: use more centres or features of your own.",
+            "See the pictures below. If these answers are mistakes, the lapse rate allows for them, unless it is set. "
+            "If they are right, the features cannot express what matters: use more centres or features of your own.",
         )
     if (surprising := question[answers["before"].values < SURPRISING]).size:
         yield ReportWarning(
