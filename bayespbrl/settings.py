@@ -5,6 +5,7 @@ Users name an option alone: in keywords, on the command line, in `settings.json`
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any
 
 from bayespbrl import checks
@@ -110,7 +111,7 @@ class Settings:
     environment: str = "named"
     expert: str = "return"
     wrong_answers: float = 0.0
-    model: PreferenceModel = field(default_factory=PreferenceModel)
+    model: PreferenceModel = field(default_factory=partial(PreferenceModel, steepness=None, lapse_rate=None))
     estimation: Estimation = field(default_factory=Estimation)
     features: Features = field(default_factory=Features)
     critic: Critic = field(default_factory=Critic)
@@ -183,7 +184,7 @@ PARTS: dict[str, Any] = {
     "rollouts": Rollouts,
     "questions": Questions,
 }
-# The part that reads each option; "" for the run's own. Answers of "no difference" have no place in a run yet.
+# The part that reads each option; "" for the run's own. The tie threshold has none: a run infers it.
 OPTIONS: dict[str, str] = {f.name: "" for f in fields(Settings) if f.name not in ("env", *PARTS)} | {
     option.name: part for part, kind in PARTS.items() for option in fields(kind) if option.name != "tie_threshold"
 }

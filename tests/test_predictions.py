@@ -3,12 +3,13 @@ import pytest
 import xarray as xr
 from scipy.special import expit, ndtr
 
-from bayespbrl.diagnostics import answer_probabilities, predictions
+from bayespbrl.diagnostics import answer_probabilities
 from bayespbrl.diagnostics.predictions import held_out_probabilities, refit
 from bayespbrl.models import PreferenceModel, sample_posterior
 from bayespbrl.models.low_rank import low_rank
 
 SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+SAMPLE = ("chain", "draw")
 KNOWN = np.array([[0.8, -0.3, 0.0], [0.2, 0.9, 0.0]])
 ASKED = np.array([[1.0, 0.4, 0.7], [-0.3, 0.5, 0.0], [0.0, 0.0, 1.3], [0.0, 0.0, 0.0], [0.8, -0.3, 0.0]])
 
@@ -59,22 +60,50 @@ def test_predictions_agree_with_quadrature_over_all_utility_weights(name):
         np.testing.assert_allclose(got[2:4, :2], 0.5, atol=1e-12)
 
 
-def test_the_opposite_question_has_the_opposite_answer():
-    z = np.random.default_rng(0).normal([1.0, 0.5, 0.0], 0.3, size=(2, 50, 3)) @ low_rank(KNOWN).basis
+@pytest.mark.parametrize("settings", [KNOWN, np.array([KNOWN, 3.0 * KNOWN[:, ::-1]])], ids=["one setting", "two"])
+def test_the_opposite_question_has_the_opposite_answer(settings):
+    rng, shape = np.random.default_rng(0), (2, 50)
+    number = rng.integers(1 if settings.ndim == 2 else 2, size=shape)
+    bases = [low_rank(rows).basis for rows in settings.reshape(-1, *KNOWN.shape)]
+    weights = rng.normal([1.0, 0.5, 0.0], 0.3, size=(*shape, 3))
+    drawn = {
+        "coordinates": ((*SAMPLE, "coordinate"), np.einsum("cdf,cdfr->cdr", weights, np.array(bases)[number])),
+        "setting": (SAMPLE, number),
+        "steepness": (SAMPLE, rng.uniform(2, 6, size=shape)),
+        "lapse_rate": ((*SAMPLE, "answerer"), rng.uniform(0, 0.3, size=(*shape, 1))),
+        "tie_threshold": (SAMPLE, rng.uniform(0.1, 0.3, size=shape)),
+    }
+    attributes = vars(PreferenceModel(1.3, 4.0, 0.1, "mixed", 0.2)) | {"number_of_preferences": 2}
+    dimensions = ("setting", "preference", "feature")[3 - settings.ndim :]
     tree = xr.DataTree.from_dict(
         {
-            "/": xr.Dataset(attrs=vars(PreferenceModel(1.3, 4.0, 0.1, "mixed", 0.2)) | {"number_of_preferences": 2}),
-            "/posterior": xr.Dataset({"coordinates": (("chain", "draw", "coordinate"), z)}),
-            "/constant_data": xr.Dataset({"differences": (("preference", "feature"), KNOWN)}),
+            "/": xr.Dataset(attrs=attributes),
+            "/posterior": xr.Dataset(drawn),
+            "/observed_data": xr.Dataset({"answers": ("preference", np.array([1, 0]))}),
+            "/constant_data": xr.Dataset({"differences": (dimensions, settings)}),
         }
     )
-    forth, back = answer_probabilities(tree, ASKED), answer_probabilities(tree, -ASKED)
+    asked = np.broadcast_to(ASKED, (*settings.shape[:-2], *ASKED.shape))
+    forth, back = answer_probabilities(tree, asked), answer_probabilities(tree, -asked)
     np.testing.assert_allclose(forth[:, [1, 0, 2]], back, atol=1e-12)
+    np.testing.assert_allclose(forth.sum(axis=1), 1.0, atol=1e-12)
     assert abs(forth[0, 0] - forth[0, 1]) > 0.1
 
 
-def test_without_answers_the_prior_predicts_and_no_chain_is_run(monkeypatch):
-    monkeypatch.setattr(predictions, "posterior_draws", None)  # a call would fail
+def test_each_draw_predicts_by_its_own_setting_steepness_and_lapse_rate():
+    tree = sample_posterior(
+        np.array([KNOWN, 3.0 * KNOWN[:, ::-1]]), steepness=None, lapse_rate=None, likelihood="logistic", **SAMPLING
+    )
+    asked = np.array([ASKED, 3.0 * ASKED[:, ::-1]])[:, -1:]  # the first answer again, without any part outside
+    drawn = tree["posterior"].dataset.isel(draw=slice(None, None, 2))
+    margins = drawn["margins"].values[:, :, 0]
+    lapse_rate = drawn["lapse_rate"].values[:, :, 0]
+    p = lapse_rate / 2 + (1 - lapse_rate) * expit(drawn["steepness"].values * margins)
+    assert len(np.unique(drawn["setting"])) == 2
+    np.testing.assert_allclose(answer_probabilities(tree, asked)[0], [p.mean(), 1 - p.mean(), 0], atol=1e-6)
+
+
+def test_without_answers_the_prior_predicts():
     nothing, everything = np.zeros(5, dtype=bool), np.ones(5, dtype=bool)
     model = PreferenceModel(steepness=2.0, tie_threshold=0.4, likelihood="probit", prior_scale=0.7)
     got, converged = held_out_probabilities(ASKED, model, nothing, everything)

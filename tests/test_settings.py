@@ -94,6 +94,17 @@ def test_changes_win_over_presets_and_none_changes_nothing():
     assert settings_for("SomebodysEnv-v3") == Settings("SomebodysEnv-v3")
 
 
+def test_steepness_and_lapse_rate_are_inferred_unless_they_or_all_hyperparameters_are_given():
+    model = settings_for("gridworld").model
+    assert (model.steepness, model.lapse_rate) == (None, None)
+    model = settings_for("gridworld", hyperparameters="given").model
+    assert (model.steepness, model.lapse_rate) == (5.0, 0.0)
+    model = settings_for("gridworld", steepness=3.0).model
+    assert (model.steepness, model.lapse_rate) == (3.0, None)
+    model = settings_for("gridworld", hyperparameters="given", lapse_rate=0.2).model
+    assert (model.steepness, model.lapse_rate) == (5.0, 0.2)
+
+
 @pytest.mark.parametrize("env", PRESETS)
 def test_every_preset_is_valid_and_survives_json(env):
     settings = settings_for(env, seed=5)

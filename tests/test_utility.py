@@ -1,16 +1,15 @@
 """Step 1 on small cases: three discrete states, one-hot features, so that ψ can be written down."""
 
 import itertools
-from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
 import scipy.optimize
 
-from bayespbrl.features import OneHot
+from bayespbrl.features import OneHot, RadialBasis
 from bayespbrl.models import PreferenceModel
-from bayespbrl.models.likelihoods import Logistic, Mixed, WithLapses, log_prob
+from bayespbrl.models.likelihoods import Mixed, WithLapses, log_prob
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
 from bayespbrl.utility import KnownReward, inference
 from bayespbrl.utility.comparisons import Comparisons
@@ -30,7 +29,8 @@ ONE_HOT = OneHot(3)
 
 def estimate_utility(trajectories, pairs, features, *, method, discount=0.9, seed=0):
     comparisons = Comparisons.among(trajectories, pairs, discount=discount)
-    return inference.estimate_utility(comparisons, features, PreferenceModel(), method=method, seed=seed)
+    options = inference.Estimation(utility=method)
+    return inference.estimate(comparisons, features, options, PreferenceModel(), seed=seed)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -58,7 +58,7 @@ def test_a_trajectorys_utility_is_the_discounted_sum_of_its_steps(method):
 def test_the_utility_of_a_step_is_that_of_its_next_state():
     steps = transitions([Trajectory(np.array([0, 2, 1]), np.zeros(2, dtype=int), np.zeros(2))])
     estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="linear-program", discount=0.9)
-    np.testing.assert_array_equal(estimate.step_utilities(steps), estimate.weights[[2, 1]])
+    np.testing.assert_array_equal(estimate.step_utilities(steps), np.ravel(estimate.weights)[[2, 1]])
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -71,7 +71,7 @@ def test_features_in_other_units_give_the_same_utilities(method):
 
 def test_without_pairs_the_posterior_mean_is_the_priors_zero_and_nothing_is_claimed():
     estimate = estimate_utility(TRAJECTORIES, [], ONE_HOT, method="posterior-mean", discount=0.9)
-    np.testing.assert_array_equal(estimate.weights, np.zeros(3))
+    np.testing.assert_array_equal(estimate.weights, np.zeros((1, 3)))
     assert (estimate.quality.pairs, estimate.quality.pairs_satisfied) == (0, 0)
     assert estimate.quality.log_evidence == pytest.approx(0.0, abs=1e-12)
 
@@ -90,16 +90,16 @@ def test_a_pair_that_the_features_cannot_tell_apart_is_survived_and_counted_as_u
 
 
 def test_with_one_pair_the_posterior_mean_is_along_its_difference_and_matches_quadrature():
-    # K = 1 leaves the sigmoid: w = z·d/|d| with density ∝ N(z; 0, 1) sigmoid(m |d| z), d scaled to (0, −1, 1).
+    # K = 1 leaves the sigmoid: w = z·d with density ∝ N(z; 0, 1) sigmoid(m z), d scaled to (0, −1, 1)/√2.
     estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-mean", discount=0.9)
-    scale = np.sum(0.9 ** np.arange(4))
+    scale = np.sqrt(2) * np.sum(0.9 ** np.arange(4))
     z = np.linspace(-10, 10, 20001)
-    density = np.exp(-0.5 * z**2) / (1 + np.exp(-5 * np.sqrt(2) * z))
+    density = np.exp(-0.5 * z**2) / (1 + np.exp(-5 * z))
     mean = z @ density / density.sum() / np.sqrt(2)
-    np.testing.assert_allclose(scale * estimate.weights, [0, -mean, mean], atol=0.04)
-    assert estimate.weights[0] == 0
+    np.testing.assert_allclose(scale * estimate.weights, [[0, -mean, mean]], atol=0.04)
+    assert estimate.weights[0, 0] == 0
     evidence = np.log(density.sum() * (z[1] - z[0]) / np.sqrt(2 * np.pi))
-    assert estimate.quality.log_evidence == pytest.approx(evidence, abs=0.02)
+    assert estimate.quality.log_evidence == pytest.approx(evidence, abs=4 * estimate.posterior.attrs["log_evidence_error"])
 
 
 def test_most_likely_explains_the_answers_at_least_as_well_as_the_mean():
@@ -108,7 +108,7 @@ def test_most_likely_explains_the_answers_at_least_as_well_as_the_mean():
     )
     features = trajectory_features(TRAJECTORIES, ONE_HOT, discount=0.9)
     differences = np.array([features[i] - features[j] for i, j in PAIRS])
-    margins = {e: differences @ w for e, w in (("mean", means.weights), ("most", likeliest.weights))}
+    margins = {e: differences @ w[0] for e, w in (("mean", means.weights), ("most", likeliest.weights))}
     assert np.sum(np.log1p(np.exp(-5 * margins["most"]))) <= np.sum(np.log1p(np.exp(-5 * margins["mean"])))
 
 
@@ -123,73 +123,170 @@ def test_the_same_seed_gives_the_same_draws_and_another_gives_others():
 
 def test_a_posterior_draw_is_a_draw_without_what_the_answers_do_not_touch():
     estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-draw", discount=0.9, seed=4)
-    assert estimate.weights[0] == 0  # never compared
-    assert estimate.weights[1] == -estimate.weights[2]  # only their difference was
-    draws = estimate.draws(np.array([[0.0, -1.0, 1.0]]))
-    assert np.isclose(draws, estimate.weights[2] - estimate.weights[1], rtol=1e-12).sum() == 1
+    (weights,) = estimate.weights
+    assert weights[0] == 0  # never compared
+    assert weights[1] == -weights[2]  # only their difference was
+    _, draws = estimate.utilities_and_draws(np.arange(3))
+    assert np.isclose(draws[:, 2] - draws[:, 1], weights[2] - weights[1], rtol=1e-12).sum() == 1
 
 
 def test_posterior_draws_of_many_seeds_are_spread_as_the_posterior_is():
     estimate = estimate_utility(TRAJECTORIES, [(2, 1)], ONE_HOT, method="posterior-mean", discount=0.9)
-    drawn = [inference._weights(estimate.posterior, "posterior-draw", seed) for seed in range(400)]
-    margins = np.array(drawn) @ [0, -1, 1] / estimate.scale
-    draws = estimate.draws(np.array([[0.0, -1.0, 1.0]]))
+    drawn = [inference._parts(estimate.posterior, "posterior-draw", seed)[0] for seed in range(400)]
+    margins = np.array(drawn) @ [0, -1, 1] / estimate.scales[0]
+    _, utilities = estimate.utilities_and_draws(np.arange(3))
+    draws = utilities[:, 2] - utilities[:, 1]
     assert np.std(margins) == pytest.approx(draws.std(), rel=0.15)
     assert abs(np.mean(margins) - draws.mean()) < 4 * draws.std() / np.sqrt(400)
 
 
-def test_fewer_draws_are_some_of_all_evenly_spaced():
-    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="posterior-mean", discount=0.9)
-    every = estimate.draws(np.eye(3))
-    chains, length = every.shape[:2]
-    np.testing.assert_array_equal(estimate.draws(np.eye(3), number=chains * length), every)
-    np.testing.assert_allclose(estimate.draws(np.eye(3), number=100), every[:, :: length * chains // 100], rtol=1e-12)
-    np.testing.assert_allclose(estimate.draws(np.eye(3), number=1), every[:, :1], rtol=1e-12)
+@pytest.fixture(scope="module")
+def walked():
+    """An estimate over 9 settings of the length scales in the plane, and the trajectories behind it."""
+    rng = np.random.default_rng(5)
+    walks = [
+        Trajectory(np.clip(np.cumsum(rng.normal(0, 0.4, (7, 2)), axis=0), -1, 1), np.zeros((6, 1)), np.zeros(6))
+        for _ in range(6)
+    ]
+    centres = rng.uniform(-1, 1, (8, 2))
+    features = RadialBasis(centres, np.array([0.4, 0.6]), np.full(2, np.inf), normalised=True)
+    comparisons = Comparisons.among(walks, [(0, 1), (2, 3), (0, 4), (2, 5)], discount=0.9)
+    model = PreferenceModel(steepness=None, lapse_rate=None, likelihood="logistic")
+    return inference.estimate(comparisons, features, inference.Estimation(), model, seed=2), walks
+
+
+def test_fewer_draws_are_some_of_all_evenly_spaced(walked):
+    estimate, walks = walked
+    states = walks[0].states
+    _, every = estimate.utilities_and_draws(states)
+    chains, length = estimate.posterior["posterior"]["setting"].shape
+    every = every.reshape(chains, length, len(states))
+    for number, apart in ((chains * length, 1), (100, length * chains // 100), (1, chains * length)):
+        mean, draws = estimate.utilities_and_draws(states, number=number)
+        np.testing.assert_array_equal(mean, estimate.utilities(states))
+        np.testing.assert_allclose(draws, every[:, ::apart].reshape(-1, len(states)), rtol=1e-9, atol=1e-12)
     with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
-        estimate.draws(np.eye(3), number=0)
+        estimate.utilities_and_draws(states, number=0)
 
 
-def test_draws_of_a_trajectory_are_those_of_its_feature_sum():
-    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="posterior-mean", discount=0.9)
+def test_a_trajectory_is_worth_the_discounted_sum_of_its_states_in_the_mean_and_in_every_draw(walked):
+    estimate, walks = walked
+    mean, draws = estimate.utilities_and_draws(np.concatenate([walk.states[1:] for walk in walks]), number=40)
+    powers = 0.9 ** np.arange(6)
+    np.testing.assert_allclose(estimate.trajectory_utilities(walks), mean.reshape(6, 6) @ powers, atol=1e-10)
+    of_trajectories = estimate.trajectory_draws(walks, number=40)
+    np.testing.assert_allclose(of_trajectories, draws.reshape(-1, 6, 6) @ powers, atol=1e-10)
+
+
+def test_the_mean_is_the_mean_of_the_draws_over_all_settings(walked):
+    estimate, walks = walked
+    assert len(np.unique(estimate.posterior["posterior"]["setting"])) > 5  # four answers leave nearly all open
+    mean, draws = estimate.utilities_and_draws(walks[0].states)
+    # but for the directions that no answer touches, which are drawn from the prior
+    np.testing.assert_allclose(mean, draws.mean(axis=0), atol=5 * draws.std(axis=0).max() / np.sqrt(len(draws)))
+    np.testing.assert_allclose(
+        estimate.trajectory_utilities(walks[:2]) @ [1, -1], estimate.margin_draws(*walks[:2]).mean(), rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        estimate.margin_draws(*walks[:2]),
+        estimate.posterior["posterior"]["margins"].values[:, :, 0].ravel(),
+        rtol=1e-9,
+        atol=1e-12,
+    )
+
+
+def test_each_draw_is_of_the_features_of_its_own_setting(walked):
+    estimate, walks = walked
+    states = walks[1].states
+    _, draws = estimate.utilities_and_draws(states)
+    drawn = estimate.posterior["posterior"]
+    numbers = drawn["setting"].values
+    weights = drawn["utility_weights"].values.reshape(numbers.size, -1)
+    for draw in (0, 333, 777):
+        number = numbers.ravel()[draw]
+        features = estimate.features.rescaled(estimate.multiples[number])(states)
+        np.testing.assert_allclose(draws[draw], features @ weights[draw] / estimate.scales[number], atol=1e-12)
+
+
+def test_a_setting_of_a_very_different_scale_counts_by_its_probability_alone():
+    # the features of the second setting are those of the first, times 1000: nothing can tell the settings apart
+    one = inference.estimate(
+        Comparisons.among(TRAJECTORIES, PAIRS, discount=0.9), ONE_HOT, inference.Estimation(), PreferenceModel(), seed=1
+    )
     sums = trajectory_features(TRAJECTORIES, ONE_HOT, discount=0.9)
-    draws = estimate.trajectory_draws(TRAJECTORIES, number=40)
-    np.testing.assert_allclose(draws, estimate.draws(sums, number=40).reshape(40, 4), rtol=1e-12)
-    # trajectory 3 stays where trajectory 2 does, half as long
-    np.testing.assert_allclose(draws[:, 3] / draws[:, 2], (1 + 0.9) / np.sum(0.9 ** np.arange(4)), rtol=1e-12)
+    comparisons = Comparisons.among(TRAJECTORIES, PAIRS, discount=0.9)
+    two = inference._by_posterior(
+        [sums[:3], 1000 * sums[:3]], np.ones((2, 0)), comparisons, ONE_HOT, "posterior-mean", PreferenceModel(), 1
+    )
+    assert two.scales[1] == pytest.approx(1000 * two.scales[0])
+    numbers = two.posterior["posterior"]["setting"].values
+    assert np.mean(numbers) == pytest.approx(0.5, abs=0.06)
+    by_setting = [two.weights[0] @ np.eye(3), 1000 * two.weights[1] @ np.eye(3)]
+    for part, share in zip(by_setting, (np.mean(numbers == 0), np.mean(numbers == 1)), strict=True):
+        np.testing.assert_allclose(part, share * one.weights[0], atol=0.06 * np.abs(one.weights).max())
 
 
-def test_the_likelihood_of_the_next_answer_is_that_of_the_fit():
-    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="posterior-mean", discount=0.9)
-    assert estimate.likelihood == Mixed(5.0, 2.0)
-    for options, expected in (
-        ({"steepness": 3.0, "likelihood": "logistic"}, Logistic(3.0)),
-        ({"lapse_rate": 0.25}, WithLapses(Mixed(5.0, 2.0), 0.25)),
-    ):
-        fit = estimate.posterior.copy()
-        fit.attrs |= options
-        assert replace(estimate, posterior=fit).likelihood == expected
+def test_the_likelihood_of_the_next_answer_has_the_steepness_and_lapse_rate_of_each_draw(walked):
+    estimate, walks = walked
+    for number in (None, 40):
+        margins = np.stack(
+            [
+                estimate.trajectory_draws([walks[i], walks[j]], number=number) @ [1, -1]
+                for i, j in ((0, 1), (2, 3), (0, 4), (2, 5))
+            ],
+            axis=-1,
+        )
+        with jax.enable_x64(True):
+            answers = np.asarray(log_prob(estimate.likelihood(number), margins))
+        kept = estimate.posterior["log_likelihood"]["answers"].values
+        apart = 1 if number is None else kept.shape[0] * kept.shape[1] // 40
+        np.testing.assert_allclose(answers, kept[:, ::apart].reshape(answers.shape), atol=1e-9)
+    drawn = estimate.posterior["posterior"]
+    assert len(np.unique(drawn["steepness"])) > 1
+    assert len(np.unique(drawn["lapse_rate"])) > 1
 
 
-def test_the_likelihood_takes_differences_of_utilities_as_they_are():
-    def twenty_fold(states):
-        return 20 * ONE_HOT(states)
-
-    estimate = estimate_utility(TRAJECTORIES, PAIRS, twenty_fold, method="posterior-mean", discount=0.9)
-    assert estimate.scale > 20
-    draws = estimate.draws(trajectory_features(TRAJECTORIES, twenty_fold, discount=0.9))
-    margins = np.stack([draws[..., i] - draws[..., j] for i, j in PAIRS], axis=-1)
+def test_the_likelihood_has_what_was_given_in_every_draw():
+    comparisons = Comparisons.among(TRAJECTORIES, PAIRS, discount=0.9)
+    model = PreferenceModel(steepness=3.0, lapse_rate=0.25)
+    estimate = inference.estimate(comparisons, ONE_HOT, inference.Estimation(), model, seed=0)
     with jax.enable_x64(True):
-        answers = log_prob(estimate.likelihood, margins)
-    np.testing.assert_allclose(answers, estimate.posterior["log_likelihood"]["answers"], atol=1e-10)
+        found = np.asarray(log_prob(estimate.likelihood(4), np.full((4, 1), 0.3)))
+        expected = np.asarray(log_prob(WithLapses(Mixed(3.0, 2.0), 0.25), np.array([0.3])))
+    np.testing.assert_allclose(found, np.full((4, 1), expected[0]), rtol=1e-12)
+
+
+def test_what_was_inferred_is_summed_up_by_mean_and_interval(walked):
+    estimate, _ = walked
+    found, drawn = estimate.hyperparameters(), estimate.posterior["posterior"]
+    for name in ("steepness", "lapse_rate"):
+        values = drawn[name].values.ravel()
+        assert found[name] == pytest.approx(values.mean())
+        assert found[f"{name} lower"] <= found[name] <= found[f"{name} upper"]
+    multiples = estimate.multiples[drawn["setting"].values.ravel()]
+    np.testing.assert_allclose(found["bandwidth_multiples"], np.exp(np.log(multiples).mean(axis=0)))
+    assert 1 / 9 < found["most probable length scales"] < 1
+
+
+def test_ties_bring_equal_utilities_and_an_inferred_threshold():
+    tied, stated = (
+        inference.infer_utility(np.eye(3), pairs, ties=ties, likelihood="logistic", seed=0)
+        for pairs, ties in (([(2, 0)], [(1, 0)] * 4), ([(2, 0), *[(1, 0)] * 4], []))
+    )
+    assert "tie_threshold" in tied.posterior["posterior"]
+    assert "tie_threshold" not in stated.posterior["posterior"]
+    margins = [fit.weights[0] * fit.scales[0] for fit in (tied, stated)]
+    assert abs(margins[0][1] - margins[0][0]) < 0.3 * (margins[1][1] - margins[1][0])
+    assert (tied.quality.pairs, stated.quality.pairs) == (1, 5)
 
 
 def test_without_a_posterior_there_are_no_draws_and_no_likelihood():
     estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="linear-program", discount=0.9)
-    assert estimate.sampled is None
-    with pytest.raises(ValueError, match="likelihood: expected an estimate with a posterior"):
-        _ = estimate.likelihood
+    assert estimate.posterior is None
+    assert estimate.hyperparameters() is None
     one, other = TRAJECTORIES[:2]
     for name, arguments in {
+        "likelihood": (),
         "trajectory_draws": ([one],),
         "margin_draws": (one, other),
         "utilities_and_draws": (np.arange(3),),
@@ -205,7 +302,8 @@ def test_the_linear_program_reaches_the_optimum_that_scipy_finds():
     pairs = [(int(i), int(j)) for i, j in itertools.combinations(rng.permutation(6), 2)]
     estimate = estimate_utility(trajectories, pairs, lambda s: features[s], method="linear-program", discount=0.9)
     differences = np.array([features[i] - features[j] for i, j in pairs])
-    differences /= np.abs(differences).max()
+    scale = np.sqrt(np.mean(np.sum(differences**2, axis=1)))
+    differences /= scale
     rows, columns = differences.shape
     oracle = scipy.optimize.linprog(
         np.concatenate([np.zeros(columns), -np.ones(rows)]),
@@ -213,7 +311,6 @@ def test_the_linear_program_reaches_the_optimum_that_scipy_finds():
         b_ub=np.zeros(2 * rows),
         bounds=[(-1, 1)] * columns + [(None, None)] * rows,
     )
-    scale = np.abs(np.array([features[i] - features[j] for i, j in pairs])).max()
     margins = differences @ (scale * estimate.weights)
     assert np.sum(np.minimum(margins, 2 * margins)) == pytest.approx(-oracle.fun, rel=1e-7)
     assert np.abs(scale * estimate.weights).max() <= 1 + 1e-9
@@ -236,5 +333,7 @@ def test_features_that_are_not_finite_are_refused():
 
 
 def test_an_unknown_method_is_refused():
-    with pytest.raises(ValueError, match=r"method: expected .*posterior-mean.*got 'median'"):
+    with pytest.raises(ValueError, match=r"utility: expected .*posterior-mean.*got 'median'"):
         estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="median", discount=0.9)
+    with pytest.raises(ValueError, match=r"method: expected .*posterior-mean.*got 'median'"):
+        inference.infer_utility(np.eye(3), [(1, 0)], method="median")

@@ -45,6 +45,8 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
         others = refit(tree, np.arange(number) != k, **sampling_options)
         weights = np.asarray(others["utility_weights_mean"])
         means[k] = np.einsum("ckd,cd->k", settings_of(differences), np.atleast_2d(weights))
+        if "side_bias" in others["posterior"]:
+            means[k] += float(others["posterior"]["side_bias"].mean()) * np.asarray(tree["constant_data"]["shown_first"])
         changes[k] = _length(means[k] - margin_mean)
         probability[k] = answer_probabilities(others, differences[..., [k], :])[0, outcome[k]]
         converged[k] = bool(others.attrs["converged"])
@@ -79,7 +81,7 @@ def _estimates(tree: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
     """k̂ and the root mean square change of the margins' means, each shape (K,)."""
     margins = np.asarray(tree["posterior"]["margins"])
     log_likelihood = np.asarray(tree["log_likelihood"]["answers"])
-    draws = margins.reshape(-1, margins.shape[2])
+    draws = margins.reshape(margins.shape[0] * margins.shape[1], margins.shape[2])
     pareto_k, change = np.zeros(log_likelihood.shape[2]), np.zeros(log_likelihood.shape[2])
     for k, column in enumerate(np.moveaxis(log_likelihood, 2, 0)):
         if np.ptp(column) == 0:  # a row of zeros: all weights are equal

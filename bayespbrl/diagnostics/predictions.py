@@ -72,7 +72,8 @@ def _every(tree: xr.DataTree) -> dict[str, np.ndarray]:
     names = [name for name in ("setting", "coordinates", *PARAMETERS) if name in drawn]
     parts = {name: drawn[name].values[:, ::apart] for name in names}
     parts["lapse_rate"] = parts["lapse_rate"][:, :, 0]
-    return {name: part.reshape(-1, *part.shape[2:]) for name, part in parts.items()}
+    draws = parts["setting"].size
+    return {name: part.reshape(draws, *part.shape[2:]) for name, part in parts.items()}
 
 
 def held_out_probabilities(
