@@ -67,7 +67,7 @@ def gridworld_copy(gridworld_run, tmp_path):
 def swing_up_learner(tmp_path_factory):
     """A finished swing-up run with all options of uncertainty: its directory and its learner; not to be changed."""
     directory = tmp_path_factory.mktemp("runs") / "swing-up"
-    uncertainty = {"schedule": "confidence", "query": "information-when-unsure", "hyperparameters": "averaged"}
+    uncertainty = {"schedule": "confidence", "query": "information-when-unsure", "hyperparameters": "inferred"}
     options = {"updates_per_iteration": 2, "unasked_iterations": 1, "iterations": 4, "centres": 30, "seed": 3}
     learner = bayespbrl.start("swing-up", directory, **uncertainty, **options, **QUICK)
     return directory, learner.run(bayespbrl.ReturnExpert())

@@ -85,7 +85,9 @@ def test_the_change_is_of_the_margins_with_the_side_bias_in_them():
     # without answer k, the mean of its own margin is that of the prior in what the others do not touch
     others = predictions.refit(tree, np.arange(3) != k, **SAMPLING)
     np.testing.assert_allclose(
-        np.delete(result["margin_means"][k].values, k), others["posterior"]["margins"].mean(("chain", "draw")), atol=1e-9
+        np.delete(result["margin_means"][k].values, k),
+        others["posterior"]["margins"].mean(("chain", "draw")),
+        atol=1e-9,
     )
 
 

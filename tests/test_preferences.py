@@ -17,9 +17,9 @@ def test_every_undominated_one_is_preferred_over_a_worse_newcomer():
     assert before.add(7, 3, preferred=3) == Preferences(((0, 7), (2, 7), (3, 7)), (0, 2, 3), 5)
 
 
-def test_a_tie_joins_the_undominated_and_stores_no_pair():
+def test_a_tie_joins_the_undominated_and_is_kept_as_a_tie_not_as_a_pair():
     before = Preferences(pairs=((0, 5),), undominated=(0,), answers=1)
-    assert before.add(7, 0, preferred=None) == Preferences(((0, 5),), (0, 7), 2)
+    assert before.add(7, 0, preferred=None) == Preferences(((0, 5),), (0, 7), 2, ((7, 0),))
 
 
 def test_five_answers_by_hand():

@@ -20,7 +20,10 @@ class Draws:
     """An estimate whose trajectories are the numbers of columns of a table of draws."""
 
     def __init__(self, table, likelihood):
-        self.table, self.likelihood = table, likelihood
+        self.table, self.answers = table, likelihood
+
+    def likelihood(self, number=None):
+        return self.answers
 
     def trajectory_draws(self, trajectories, *, number=None):
         return self.table[:, list(trajectories)]
@@ -157,6 +160,18 @@ def test_answers_that_are_coin_tosses_tell_nothing_and_draws_that_agree_tell_not
     assert (lapsing < 0.5 * sure).all()
     tossed = expected_information(DRAWS, ZERO, likelihood=WithLapses(Logistic(3.0), 1 - 1e-9))
     np.testing.assert_allclose(tossed, 0.0, atol=1e-12)
+
+
+def test_expected_information_takes_the_steepness_and_lapse_rate_of_each_draw():
+    steepness, lapse_rate = np.array([[0.5], [2.0], [4.0], [30.0]]), np.array([[0.0], [0.3], [0.0], [0.1]])
+    each = [1 / (1 + np.exp(-m * row)) for m, row in zip(steepness, DRAWS, strict=True)]
+    p = lapse_rate / 2 + (1 - lapse_rate) * np.array(each)
+
+    def entropy(p):
+        return -p * np.log(p) - (1 - p) * np.log(1 - p)
+
+    information = expected_information(DRAWS, ZERO, likelihood=WithLapses(Logistic(steepness), lapse_rate))
+    np.testing.assert_allclose(information, entropy(p.mean(axis=0)) - entropy(p).mean(axis=0), atol=1e-7)
 
 
 @pytest.mark.parametrize("likelihood", [Mixed(5.0, 40.0), Mixed(5.0, 1.0), Logistic(1e-3), Probit(30.0)])

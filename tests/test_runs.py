@@ -68,7 +68,7 @@ def test_a_run_directory_holds_what_it_should(finished):
     assert {path.name for path in finished.iterdir()} == FILES
     assert {path.name for path in (finished / "iterations").iterdir()} == {"0001.nc", "0002.nc", "0003.nc"}
     settings = json.loads((finished / "settings.json").read_text())
-    assert settings["format"] == 2
+    assert settings["format"] == 3
     assert settings["version"] == "0.1.0"
     assert {name: settings[name] for name in QUICK} == QUICK
     assert settings["env"] == "gridworld"
@@ -469,11 +469,11 @@ def test_an_event_that_could_not_be_kept_is_taken_back_and_can_be_tried_again(tm
 SETTINGS = {
     "missing": None,
     "empty": "",
-    "no JSON": "{format: 2}",
+    "no JSON": "{format: 3}",
     "foreign": '{"name": "package", "version": "1.0"}',
     "a list": "[1, 2]",
-    "bad value": '{"format": 2, "env": "gridworld", "kl_bound": -1}',
-    "no environment": '{"format": 2}',
+    "bad value": '{"format": 3, "env": "gridworld", "kl_bound": -1}',
+    "no environment": '{"format": 3}',
     "not text": b"\xff\xfe\x00\x01",
 }
 
@@ -495,11 +495,11 @@ def test_a_directory_without_the_settings_of_a_run_is_refused(copy, content):
 
 def test_a_newer_format_is_refused_by_name(copy):
     settings = json.loads((copy / "settings.json").read_text())
-    (copy / "settings.json").write_text(json.dumps(settings | {"format": 3}))
-    with pytest.raises(ValueError, match=r"settings\.json: expected format 2, got 3 of a newer version"):
+    (copy / "settings.json").write_text(json.dumps(settings | {"format": 4}))
+    with pytest.raises(ValueError, match=r"settings\.json: expected format 3, got 4 of a newer version"):
         bayespbrl.load(copy)
-    (copy / "settings.json").write_text(json.dumps(settings | {"format": 1}))
-    with pytest.raises(ValueError, match=r"settings\.json: expected format 2, got 1: read it with the version"):
+    (copy / "settings.json").write_text(json.dumps(settings | {"format": 2}))
+    with pytest.raises(ValueError, match=r"settings\.json: expected format 3, got 2: read it with the version"):
         bayespbrl.load(copy)
 
 
@@ -712,16 +712,24 @@ def test_a_posterior_comes_back_and_the_run_goes_on_bit_for_bit(tmp_path, utilit
     for name in ("margins", "coordinates", "utility_weights"):
         np.testing.assert_array_equal(back["posterior"][name].values, given["posterior"][name].values)
     np.testing.assert_equal(dict(back.attrs), dict(given.attrs))  # NaN equals NaN
-    ones = np.eye(25)
-    np.testing.assert_array_equal(run.estimate.draws(ones), whole.estimate.draws(ones))
+    for name in ("setting", "steepness", "lapse_rate"):
+        np.testing.assert_array_equal(back["posterior"][name].values, given["posterior"][name].values)
+    for one, other in zip(*(e.utilities_and_draws(np.arange(25)) for e in (run.estimate, whole.estimate)), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow
-def test_a_run_without_any_pair_comes_back_with_its_posterior(tmp_path):
+def test_a_run_whose_answers_are_all_ties_comes_back_with_its_posterior(tmp_path):
     learner = start(tmp_path / "run", utility="posterior-mean", iterations=1).run(lambda first, second: "tie")
     run = bayespbrl.load(tmp_path / "run")
     assert fingerprint(run.learner) == fingerprint(learner)
-    np.testing.assert_array_equal(run.estimate.weights, np.zeros(25))
+    assert (run.estimate.quality.pairs, len(run.preferences.ties)) == (0, 2)
+    drawn = run.posterior["posterior"]
+    assert drawn.sizes["preference"] == 2
+    # ties say that the utilities are near each other, and not which is higher
+    draws = drawn["margins"].values
+    assert (np.abs(draws.mean(axis=(0, 1))) < 0.2 * draws.std(axis=(0, 1))).all()
+    assert float(drawn["tie_threshold"].min()) > 0
 
 
 VICTIM = """

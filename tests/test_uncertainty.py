@@ -1,7 +1,9 @@
 """From draws of the weights to returns, rankings, Q and greedy actions: on cases that can be written down."""
 
 import itertools
+from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import jax
 import matplotlib.pyplot
@@ -21,7 +23,6 @@ from bayespbrl.diagnostics.uncertainty import (
     q_draws,
     ranking_probabilities,
     return_draws,
-    successor_features,
     thinned,
 )
 from bayespbrl.features import OneHot
@@ -29,7 +30,7 @@ from bayespbrl.improvement.q_function import estimate_q
 from bayespbrl.models import PreferenceModel
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
 from bayespbrl.utility.comparisons import Comparisons
-from bayespbrl.utility.inference import estimate_utility
+from bayespbrl.utility.inference import Estimation, estimate
 
 
 def staying(state, steps=4):
@@ -43,7 +44,7 @@ TRAJECTORIES = [staying(0), staying(1), staying(2)]
 def fitted(method="posterior-mean"):
     """The estimate from one answer, 2 ≻ 1."""
     comparisons = Comparisons.among(TRAJECTORIES, [(2, 1)], discount=0.9)
-    return estimate_utility(comparisons, OneHot(3), PreferenceModel(), method=method)
+    return estimate(comparisons, OneHot(3), Estimation(utility=method), PreferenceModel(), seed=0)
 
 
 def given_returns(values):
@@ -65,22 +66,22 @@ def given_q(values):
 
 
 def test_draws_of_returns_are_draws_of_the_weights_times_feature_sums():
-    estimate = fitted()
+    utility = fitted()
     sums = trajectory_features(TRAJECTORIES, OneHot(3), discount=0.9)
-    weights = estimate.posterior["posterior"]["utility_weights"].values / estimate.scale
-    all_of_them = return_draws(estimate, TRAJECTORIES, number=10**9)["returns"]
+    weights = utility.posterior["posterior"]["utility_weights"].values / utility.scales[0]
+    all_of_them = return_draws(utility, TRAJECTORIES, number=10**9)["returns"]
     np.testing.assert_allclose(all_of_them, weights @ sums.T, rtol=1e-12)
-    some = return_draws(estimate, TRAJECTORIES, number=100)
+    some = return_draws(utility, TRAJECTORIES, number=100)
     assert some["returns"].sizes["chain"] * some["returns"].sizes["draw"] <= 100
     assert np.isin(some["returns"].values, all_of_them.values).all()
-    assert (some.attrs["converged"], some.attrs["rhat_max"]) == (1, estimate.quality.rhat_max)
+    assert (some.attrs["converged"], some.attrs["rhat_max"]) == (1, utility.quality.rhat_max)
 
 
 def test_the_probability_to_be_better_matches_quadrature_over_the_only_margin():
-    # One answer, 2 ≻ 1: with the differences scaled to (0, −1, 1) and K = 1 the margin is √2 z, z ~ N(0, 1), and the
-    # posterior density of z ∝ N(z) sigmoid(5 √2 z).
+    # One answer, 2 ≻ 1: with the difference scaled to length 1 and K = 1 the margin is z ~ N(0, 1), and the posterior
+    # density of z ∝ N(z) sigmoid(5 z).
     z = np.linspace(-10, 10, 20001)
-    density = np.exp(-0.5 * z**2) / (1 + np.exp(-5 * np.sqrt(2) * z))
+    density = np.exp(-0.5 * z**2) / (1 + np.exp(-5 * z))
     exact = density[z > 0].sum() / density.sum()
     ranking = ranking_probabilities(return_draws(fitted(), TRAJECTORIES, number=4000))
     assert float(ranking["better_probability"][2, 1]) == pytest.approx(exact, abs=0.02)
@@ -90,15 +91,15 @@ def test_the_probability_to_be_better_matches_quadrature_over_the_only_margin():
     )
 
 
-def test_a_thinned_estimate_has_the_draws_that_fewer_draws_are():
-    estimate = fitted()
-    some = thinned(estimate, 40)
-    np.testing.assert_array_equal(some.draws(np.eye(3)), estimate.draws(np.eye(3), number=40))
-    sizes = some.posterior["posterior"].sizes
-    assert some.posterior["sample_stats"].sizes["draw"] == sizes["draw"] == 40 / sizes["chain"]
-    np.testing.assert_array_equal(some.weights, estimate.weights)
+def test_a_thinned_posterior_has_the_draws_that_fewer_draws_are():
+    utility = fitted()
+    some = thinned(utility.posterior, 40)
+    sizes = some["posterior"].sizes
+    assert some["sample_stats"].sizes["draw"] == sizes["draw"] == 40 / sizes["chain"]
+    draws = replace(utility, posterior=some).trajectory_draws(TRAJECTORIES)
+    np.testing.assert_array_equal(draws, utility.trajectory_draws(TRAJECTORIES, number=40))
     with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
-        thinned(estimate, 0)
+        thinned(utility.posterior, 0)
 
 
 # Rankings.
@@ -146,30 +147,27 @@ def grid():
 
 
 @pytest.mark.slow
-def test_successor_features_are_the_discounted_visits_to_come_under_the_observed_frequencies(grid):
+def test_draws_of_q_are_the_utilities_of_the_discounted_visits_to_come_under_the_observed_frequencies(grid):
     steps, table, discount = transitions(grid.trajectories), grid.policy.table, grid.settings.critic.discount
     counts = np.zeros((125, 25))
     np.add.at(counts, (steps.states * 5 + steps.actions, steps.next_states), 1)
     assert (counts.sum(axis=1) > 0).all()
     frequencies = counts / counts.sum(axis=1, keepdims=True)  # P̂(s′|s, a)
     following = (frequencies[:, :, None] * table).reshape(125, 125)
-    exact = np.linalg.solve(np.eye(125) - discount * following, frequencies)
-    states, actions = np.divmod(np.arange(125), 5)
-    found = successor_features(grid)(states, actions)
-    np.testing.assert_allclose(found, exact, atol=1e-4 / (1 - discount))
-    np.testing.assert_allclose(found.sum(axis=1), 1 / (1 - discount), rtol=1e-5)  # one visit a step, for ever
+    visits = np.linalg.solve(np.eye(125) - discount * following, frequencies)
+    q = q_draws(grid, np.arange(25), np.arange(5), number=10**9)["q"]
+    assert q.dims == ("chain", "draw", "state", "action")
+    _, utilities = grid.estimate.utilities_and_draws(np.arange(25))
+    expected = utilities @ visits.T
+    np.testing.assert_allclose(q.values.reshape(expected.shape), expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_draws_of_q_are_draws_of_the_weights_times_successor_features(gridworld_run):
+def test_fewer_draws_of_q_are_some_of_all(gridworld_run):
     learner = load(gridworld_run).learner
     states, actions = np.array([0, 12, 24]), np.arange(5)
-    successors = successor_features(learner)
-    q = q_draws(learner.estimate, successors, states, actions, number=10**9)["q"]
-    assert q.dims == ("chain", "draw", "state", "action")
-    weights = learner.estimate.posterior["posterior"]["utility_weights"].values / learner.estimate.scale
-    for (i, state), action in itertools.product(enumerate(states), actions):
-        row = successors(np.array([state]), np.array([action]))[0]
-        np.testing.assert_allclose(q[:, :, i, action], weights @ row, rtol=1e-9, atol=1e-9)
+    every, some = (q_draws(learner, states, actions, number=number)["q"].values for number in (10**9, 40))
+    assert some.shape == (4, 10, 3, 5)
+    np.testing.assert_allclose(some, every[:, :: every.shape[1] // 10], rtol=1e-9, atol=1e-9)
 
 
 CONTINUOUS = {
@@ -183,27 +181,30 @@ CONTINUOUS = {
 
 
 @pytest.mark.slow
-def test_q_of_any_weights_is_what_lstd_gives_for_their_utilities():
+def test_q_of_each_draw_is_what_lstd_gives_for_its_utilities_alone():
     learner = Learner("swing-up", **CONTINUOUS, seed=5).run(ReturnExpert())
-    successors = successor_features(learner, seed=2)
     steps = transitions(learner.trajectories)
-    weights = np.random.default_rng(0).normal(size=len(learner.estimate.weights))
-    alone = estimate_q(
-        learner.policy,
-        steps,
-        learner.estimate.features(steps.next_states) @ weights,
-        key=jax.random.key(2),
-        action_space=learner.environment.action_space,
-        features=successors.features,
-        critic=learner.settings.critic,
-    )
-    expected = alone(steps.states, steps.actions)
-    found = successors(steps.states, steps.actions) @ weights
-    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
     forces = np.linspace(-30, 30, 7)[:, None]
-    q = q_draws(learner.estimate, successors, steps.states[:3], forces, number=200)
+    q = q_draws(learner, steps.states[:3], forces, number=200, seed=2)
     assert q["q"].shape == (4, 50, 3, 7)
     np.testing.assert_array_equal(q["action"], forces[:, 0])
+    _, utilities = learner.estimate.utilities_and_draws(steps.next_states, number=200)
+    assert len(np.unique(learner.estimate.posterior["posterior"]["setting"])) > 1
+    for number in (0, 77, 199):
+        alone = estimate_q(
+            learner.policy,
+            steps,
+            utilities[number],
+            key=jax.random.key(2),
+            action_space=learner.environment.action_space,
+            features=learner.feature_source.of_steps(
+                steps, learner.settings.features.of_critic, rng=np.random.default_rng(2)
+            ),
+            critic=learner.settings.critic,
+        )
+        expected = alone(np.repeat(steps.states[:3], 7, axis=0), np.tile(forces, (3, 1)))
+        found = q["q"].values.reshape(200, 21)[number]
+        np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
     greedy = greedy_probabilities(q)
     np.testing.assert_allclose(greedy["greedy_probability"].sum("action"), 1)
     assert np.isin(greedy["greedy_of_mean"], forces).all()
@@ -259,22 +260,22 @@ def test_a_level_that_all_have_in_common_is_left_out_of_the_figures():
 
 @pytest.mark.parametrize("method", ["linear-program", "known-reward"])
 def test_an_estimate_without_a_posterior_is_refused(method):
-    estimate = fitted(method=method)
+    utility = fitted(method=method)
     with pytest.raises(ValueError, match=r"estimate: expected one with a posterior, got .* without"):
-        return_draws(estimate, TRAJECTORIES)
+        return_draws(utility, TRAJECTORIES)
     with pytest.raises(ValueError, match="estimate: expected one with a posterior"):
-        q_draws(estimate, None, np.arange(2), np.arange(2))
+        q_draws(SimpleNamespace(estimate=utility), np.arange(2), np.arange(2))
 
 
-def test_a_learner_before_its_first_iteration_has_no_successor_features():
+def test_a_learner_before_its_first_iteration_has_no_draws_of_q():
     with pytest.raises(ValueError, match="estimate: expected one with a posterior, got NoneType without"):
-        successor_features(Learner("gridworld"))
+        q_draws(Learner("gridworld"), np.arange(2), np.arange(2))
 
 
 @pytest.mark.parametrize(("states", "actions"), [([], [1]), ([1], []), (1, [1]), ([1], 1)])
 def test_no_states_or_no_actions_are_refused(states, actions):
     with pytest.raises(ValueError, match="states, actions: expected at least one row each"):
-        q_draws(fitted(), None, states, actions)
+        q_draws(SimpleNamespace(estimate=fitted()), states, actions)
 
 
 def test_no_trajectories_no_draws_and_an_unknown_state_are_refused():

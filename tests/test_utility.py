@@ -99,7 +99,9 @@ def test_with_one_pair_the_posterior_mean_is_along_its_difference_and_matches_qu
     np.testing.assert_allclose(scale * estimate.weights, [[0, -mean, mean]], atol=0.04)
     assert estimate.weights[0, 0] == 0
     evidence = np.log(density.sum() * (z[1] - z[0]) / np.sqrt(2 * np.pi))
-    assert estimate.quality.log_evidence == pytest.approx(evidence, abs=4 * estimate.posterior.attrs["log_evidence_error"])
+    assert estimate.quality.log_evidence == pytest.approx(
+        evidence, abs=4 * estimate.posterior.attrs["log_evidence_error"]
+    )
 
 
 def test_most_likely_explains_the_answers_at_least_as_well_as_the_mean():

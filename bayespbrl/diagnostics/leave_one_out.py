@@ -46,7 +46,9 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
         weights = np.asarray(others["utility_weights_mean"])
         means[k] = np.einsum("ckd,cd->k", settings_of(differences), np.atleast_2d(weights))
         if "side_bias" in others["posterior"]:
-            means[k] += float(others["posterior"]["side_bias"].mean()) * np.asarray(tree["constant_data"]["shown_first"])
+            means[k] += float(others["posterior"]["side_bias"].mean()) * np.asarray(
+                tree["constant_data"]["shown_first"]
+            )
         changes[k] = _length(means[k] - margin_mean)
         probability[k] = answer_probabilities(others, differences[..., [k], :])[0, outcome[k]]
         converged[k] = bool(others.attrs["converged"])
