@@ -2,13 +2,11 @@
 
 import itertools
 
-import jax
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.special import expit, logsumexp
 
-from bayespbrl.models import Answers, PreferenceModel, chains, gibbs, posterior_draws, priors, sample_posterior
+from bayespbrl.models import priors, sample_posterior
 from bayespbrl.models.convergence import chain_convergence
 
 INFERRED = {"steepness": None, "lapse_rate": None}
@@ -24,7 +22,8 @@ def log_probability(t, *, m, lapse, number, threshold=None, tied=False):
 
     if threshold is None:
         return np.log(ordered(t))
-    return np.log(ordered(t + threshold) - ordered(t - threshold) if tied else ordered(t - threshold))
+    p = ordered(t + threshold) - ordered(t - threshold) if tied else ordered(t - threshold)
+    return np.log(np.maximum(p, 1e-300))
 
 
 def quadrature(settings, *, tied=None, lapses=priors.LAPSE_RATE, sides=None, answerers=None):
@@ -81,7 +80,9 @@ def agree(tree, expected):
     }
     values |= {name.replace("_", " "): drawn[name].values for name in ("tie_threshold", "side_bias") if name in drawn}
     if "side_bias" in drawn:  # the margins have the side in them
-        values["margins"] = values["margins"] - values["side bias"][..., None] * tree["constant_data/shown_first"].values
+        values["margins"] = (
+            values["margins"] - values["side bias"][..., None] * tree["constant_data/shown_first"].values
+        )
     for name, value in values.items():
         value = np.asarray(value, float)
         error = chain_convergence(value).monte_carlo_error
@@ -117,44 +118,3 @@ def test_a_side_bias_and_two_answerers_agree_with_quadrature():
     sides, answerers = np.array([1, -1, 1, 1]), np.array([0, 1, 1, 0])
     tree = sample_posterior(SETTINGS[:1], **INFERRED, shown_first=sides, answerers=answerers, **SAMPLING)
     agree(tree, quadrature(SETTINGS[:1], sides=sides, answerers=answerers)[0])
-
-
-def simulated(rng, *, number, dimension, model):
-    """A utility, its settings and answers from the prior: the differences under every setting."""
-    settings = rng.normal(size=(3, number, dimension)) / np.sqrt(dimension)
-    settings[2] *= np.linspace(0.1, 2, dimension)  # one is not like the others
-    truth = {
-        "setting": rng.integers(3),
-        "steepness": rng.choice(model.steepness_prior.values),
-        "lapse_rate": rng.choice(model.lapse_rate_prior.values, p=model.lapse_rate_prior.probabilities),
-        "w": rng.normal(size=dimension),
-    }
-    margins = settings[truth["setting"]] @ truth["w"]
-    p = np.exp(log_probability(margins, m=truth["steepness"], lapse=truth["lapse_rate"], number=number))
-    signs = np.where(rng.random(number) < p, 1.0, -1.0)
-    return settings * signs[:, None], truth
-
-
-def ranks(runs, *, number=10, seed=0, model=PreferenceModel(steepness=None, lapse_rate=None)):  # noqa: B008
-    """Ranks of the true values among draws, by functional (Talts et al. 2018)."""
-    rng, found = np.random.default_rng(seed), {"setting": [], "steepness": [], "lapse rate": [], "margin": []}
-    for run in range(runs):
-        differences, truth = simulated(rng, number=number, dimension=12, model=model)
-        with jax.enable_x64(True):
-            tree = posterior_draws(differences, model, seed=run, sampler=posterior_options())
-        drawn = tree["posterior"].dataset.isel(draw=slice(None, None, 4))
-        # a margin whose sign no answer has turned: the first row of the settings without their signs
-        unturned = differences[:, 0] * np.sign(differences[0, 0, 0])
-        weights, settings = drawn["utility_weights"].values, drawn["setting"].values
-        values = {
-            "setting": (settings == 2, truth["setting"] == 2),
-            "steepness": (drawn["steepness"].values, truth["steepness"]),
-            "lapse rate": (drawn["lapse_rate"].values[:, :, 0], truth["lapse_rate"]),
-            "margin": (np.einsum("cdf,cdf->cd", weights, unturned[settings]), unturned[truth["setting"]] @ truth["w"]),
-        }
-        for name, (sample, true) in values.items():
-            below, equal = np.sum(sample < true), np.sum(sample == true)  # ties are broken at random
-            found[name].append((below + rng.random() * (equal + 1)) / (sample.size + 1))
-    return found
-
-

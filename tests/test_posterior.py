@@ -11,17 +11,16 @@ from scipy.special import logsumexp
 
 from bayespbrl.models import (
     EllipticalSlice,
-    HyperparameterSearch,
     PreferenceModel,
     fit_gaussian,
     posterior,
     restored,
     sample_posterior,
-    search_hyperparameters,
     stored,
 )
 from bayespbrl.models.chains import CHUNK, KERNEL, Chains, _ellipses, draw_chunk
 from bayespbrl.models.convergence import Convergence, chain_convergence
+from bayespbrl.models.gibbs import conditional
 from bayespbrl.models.likelihoods import Mixed, log_prob
 from bayespbrl.models.low_rank import low_rank
 from bayespbrl.models.preference_problem import low_rank_model, padded_problem
@@ -87,7 +86,7 @@ def test_one_preference_gives_the_sigmoid():
     cdf = np.cumsum(density) / density.sum()
     draws = tree["posterior/utility_weights"].values.ravel()
     assert stats.kstest(draws[::4], lambda x: np.interp(x, w, cdf)).pvalue > 1e-3
-    np.testing.assert_allclose(tree.attrs["log_evidence"], np.log(0.5), atol=1e-9)
+    assert abs(tree.attrs["log_evidence"] - np.log(0.5)) < 4 * tree.attrs["log_evidence_error"]
 
 
 @pytest.mark.slow
@@ -234,14 +233,17 @@ def test_ellipses_of_the_low_rank_problem_have_the_models_density():
 def test_numpyros_mcmc_gives_the_same_draws_as_the_compiled_loop():
     fit = fit_gaussian(consistent(6, 9), PreferenceModel())
     with jax.enable_x64(True):
-        chains = Chains.start(fit, num_chains=4, chunk=CHUNK, seed=0)
+        chains = Chains.start([fit], num_chains=4, chunk=CHUNK, seed=0)
         options = {"num_chains": 4, "chain_method": "vectorized", "progress_bar": False}
         mcmc = MCMC(KERNEL, num_warmup=0, num_samples=5, **options)
         mcmc.post_warmup_state = chains.state
-        mcmc.run(chains.state.rng_key, chains.problem)
+        # the loop splits each key once more, for the moves of what is unknown; here nothing is
+        keys = jax.vmap(jax.random.split)(chains.state.rng_key)
+        mcmc.post_warmup_state = chains.state._replace(rng_key=keys[:, 0])
+        mcmc.run(keys[:, 0], conditional(chains.problem, jax.tree.map(lambda x: x[0], chains.unknowns)))
         z = mcmc.get_samples(group_by_chain=True)
-        margins = chains.extended(5).collected("coordinates", 5) @ fit.factors.loadings.T
-        np.testing.assert_allclose(z["margins"][:, :, :6], margins, rtol=0, atol=1e-9)
+        margins = chains.extended(1).collected("coordinates", 1) @ fit.factors.loadings.T
+        np.testing.assert_allclose(z["margins"][:, :1, :6], margins, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -249,7 +251,7 @@ def test_chains_started_in_the_far_tail_forget_it():
     differences = consistent(20, 40)
     fit = fit_gaussian(differences, PreferenceModel())
     with jax.enable_x64(True):
-        chains = Chains.start(fit, num_chains=4, chunk=CHUNK, seed=0)
+        chains = Chains.start([fit], num_chains=4, chunk=CHUNK, seed=0)
         far = chains.state.z["utility_weights"] * 0 + jnp.array([[30.0], [-30.0], [8.0], [-8.0]])
         chains = replace(chains, state=chains.state._replace(z={"utility_weights": far}))
         chains = replace(chains.extended(100), draws=()).extended(1000)
@@ -283,7 +285,7 @@ def test_forty_iterations_compile_the_sampler_at_most_five_times():
 )
 def test_simulation_based_calibration_of_the_margins(number, dimension, scale, steepness, monkeypatch):
     # the chains' diagnosis takes half of the time and changes nothing where there are no more draws to come
-    fine = Convergence(np.ones(1), np.ones(1), np.ones(1))
+    fine = Convergence(np.ones(1), np.full(1, 1e3), np.ones(1))
     monkeypatch.setattr(posterior, "chain_convergence", lambda draws: fine)
     rng = np.random.default_rng(number)
     ranks = []
@@ -308,56 +310,18 @@ def test_simulation_based_calibration_of_the_margins(number, dimension, scale, s
     assert stats.chisquare(counts, 120 * np.diff(np.ceil(np.linspace(-0.5, 100.5, 6))) / 101).pvalue > 1e-3
 
 
-def test_evidence_finds_the_length_scale_that_ordered_the_pairs():
+def test_the_posterior_finds_the_length_scale_that_ordered_the_pairs():
     rng = np.random.default_rng(1)
     points, centres = rng.uniform(-3, 3, (120, 1)), np.linspace(-3, 3, 60)
     features = {s: np.exp(-0.5 * ((points - centres) / s) ** 2) for s in (0.05, 0.7, 20.0)}
     utility = features[0.7] @ rng.normal(size=60)
-    log_evidence = []
-    for length_scale in features:
-        difference = features[length_scale][:60] - features[length_scale][60:]
-        difference *= np.sign(utility[:60] - utility[60:])[:, None]
-        log_evidence.append(fit_gaussian(difference / np.abs(difference).max(), PreferenceModel()).log_evidence)
-    assert np.argmax(log_evidence) == 1
-    assert HyperparameterSearch(np.array([list(features)]).T, np.array(log_evidence), reached=1).weights[1] > 0.9
-
-
-def test_the_climb_ends_where_no_neighbour_on_the_grid_is_more_likely_and_finds_a_length_scale_for_each_dimension():
-    rng = np.random.default_rng(3)
-    points, centres = rng.uniform(-3, 3, (160, 2)), rng.uniform(-3, 3, (150, 2))
-
-    def features(scales):
-        return np.exp(-0.5 * (((points[:, None] - centres) / scales) ** 2).sum(axis=2))
-
-    true_scales = np.array([0.7, 20.0])
-    utility = features(true_scales) @ rng.normal(size=150)
-
-    def log_evidence(point):
-        rows = features(np.array(point[:2]))
-        difference = (rows[:80] - rows[80:]) * np.sign(utility[:80] - utility[80:])[:, None]
-        return fit_gaussian(difference / np.abs(difference).max(), PreferenceModel(steepness=point[2])).log_evidence
-
-    axes = [(0.05, 0.7, 5.0, 20.0), (0.05, 0.7, 5.0, 20.0), (1.0, 5.0)]
-    search = search_hyperparameters(log_evidence, axes, start=(0.05, 0.05, 5.0), together=2)
-    assert search.best[0] == 0.7
-    assert search.best[1] >= 5.0
-    found = dict(zip(map(tuple, search.points.tolist()), search.log_evidence, strict=True))
-    assert tuple(search.points[0]) == (0.05, 0.05, 5.0)
-    assert found[search.best] == max(found.values())
-    for axis, values in enumerate(axes):
-        for value in values:
-            neighbour = (*search.best[:axis], value, *search.best[axis + 1 :])
-            if abs(values.index(value) - values.index(search.best[axis])) == 1:
-                assert log_evidence(neighbour) <= found[search.best] + 1e-6
-    np.testing.assert_allclose(search.weights.sum(), 1)
-
-
-def test_the_climb_stays_where_the_answers_say_nothing():
-    nothing = fit_gaussian(np.zeros((3, 2)), PreferenceModel()).log_evidence
-    search = search_hyperparameters(lambda _: nothing, [(1.0, 2.0)], start=(2.0,))
-    assert search.best == (2.0,)
-    with pytest.raises(ValueError, match=r"start: expected a value of each of 1 axes, got \(3.0,\)"):
-        search_hyperparameters(lambda _: nothing, [(1.0, 2.0)], start=(3.0,))
+    settings = np.array([rows[:60] - rows[60:] for rows in features.values()])
+    settings *= np.sign(utility[:60] - utility[60:])[:, None]
+    settings /= np.sqrt(np.mean(np.sum(settings**2, axis=2), axis=1))[:, None, None]
+    tree = sample_posterior(settings, num_samples=100, max_samples=100)
+    assert np.mean(tree["posterior/setting"] == 1) > 0.9
+    evidence = [fit_gaussian(each, PreferenceModel()).log_evidence for each in settings]
+    assert tree.attrs["log_evidence"] == pytest.approx(logsumexp(evidence) - np.log(3), abs=0.5)
 
 
 @pytest.mark.parametrize(
@@ -374,7 +338,9 @@ def test_the_climb_stays_where_the_answers_say_nothing():
         ({"num_samples": 0}, "num_samples: expected"),
         ({"max_samples": 10, "num_samples": 20}, "max_samples: expected"),
         ({"seed": -1}, "seed: expected"),
-        ({"indifferent": np.array([True, False])}, "tie_threshold: expected"),
+        ({"shown_first": np.array([2, 0])}, "shown_first: expected 2 whole numbers in -1 … 1"),
+        ({"answerers": np.array([0])}, "answerers: expected 2 whole numbers"),
+        ({"differences": np.ones((0, 2, 3))}, "differences: expected shape"),
         ({"indifferent": np.array([True]), "tie_threshold": 0.1}, "indifferent: expected"),
         ({"tie_threshold": 0.0}, "tie_threshold: expected"),
     ],

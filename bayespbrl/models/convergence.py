@@ -61,8 +61,9 @@ def chain_convergence(draws: ArrayLike) -> Convergence:
     if varies.any():
         statistics: Any = array_stats  # untyped
         axes = {"chain_axis": 0, "draw_axis": 1}
-        rhat[varies] = statistics.rhat(flat[:, :, varies], **axes)
-        size[varies] = statistics.ess(flat[:, :, varies], method="bulk", **axes)
-        error[varies] = statistics.mcse(flat[:, :, varies], method="mean", **axes)
+        with np.errstate(divide="ignore", invalid="ignore"):  # chains that stay each at another number: R̂ is no number
+            rhat[varies] = statistics.rhat(flat[:, :, varies], **axes)
+            size[varies] = statistics.ess(flat[:, :, varies], method="bulk", **axes)
+            error[varies] = statistics.mcse(flat[:, :, varies], method="mean", **axes)
     shape = draws.shape[2:]
     return Convergence(rhat.reshape(shape), size.reshape(shape), error.reshape(shape))

@@ -54,7 +54,7 @@ def fit_gaussian(
     number, dimension = differences.shape
     if dimension == 0:
         raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
-    tied = np.zeros(number, dtype=bool) if indifferent is None else checks.flags("indifferent", indifferent, number)
+    tied = None if indifferent is None else checks.flags("indifferent", indifferent, number)
     likelihood = model.answer_likelihood(number if number_of_preferences is None else number_of_preferences, tied)
     with one_blas_thread():
         factors = low_rank(differences)

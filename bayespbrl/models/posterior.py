@@ -69,8 +69,9 @@ def sample_posterior(
       steepness: m > 0.
       lapse_rate: λ in [0, 1), the share of answers that are coin tosses.
       likelihood: "mixed" (eq. 8), "logistic" or "probit".
-      indifferent: which answers were "no difference", shape (K,) bool. The sign of such a row does not matter.
-      tie_threshold: δ > 0: margins within it are often called ties. None: inferred where there are ties, else none.
+      indifferent: which answers were "no difference", shape (K,) bool. The sign of such a row does not matter. None:
+        nobody could say so.
+      tie_threshold: δ > 0: margins within it are often called ties. None: inferred where `indifferent` is given.
       shown_first: 1 where the preferred one was shown first, −1 where the other was, 0 where nothing is known, shape
         (K,). The margin by which the answerer favours the first shown is then inferred. None: nobody does.
       answerers: who gave each answer, numbers from 0, shape (K,): each has a lapse rate. None: one for all.

@@ -101,7 +101,7 @@ def answers_of(tree: xr.DataTree) -> Answers:
     known = tree.children["constant_data"].dataset
     tied = np.asarray(tree.children["observed_data"]["answers"]) == 0
     parts = {name: known[name].values.astype(int) for name in ("shown_first", "answerers") if name in known}
-    return Answers(tied if tied.any() else None, **parts)
+    return Answers(tied if "tie_threshold" in tree.children["posterior"].dataset else None, **parts)
 
 
 def bases_of(tree: xr.DataTree) -> list[Float[np.ndarray, "d r"]]:

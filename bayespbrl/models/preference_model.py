@@ -28,7 +28,7 @@ class PreferenceModel:
       lapse_rate: λ in [0, 1), the probability that an answer is a coin toss; None: inferred, for each answerer.
       likelihood: "mixed" (eq. 8), "logistic" (Bradley-Terry) or "probit" (Thurstone).
       tie_threshold: δ > 0, in utility: margins within it are often answered with "no difference". None: inferred where
-        there are such answers, and no threshold where there are none.
+        answers are said to be such or not, and no threshold where nothing is said.
     """
 
     prior_scale: float = 1.0
@@ -68,7 +68,7 @@ class PreferenceModel:
         Args:
           number_of_preferences: K of eq. 8.
           indifferent: which answers were "no difference", bool, one entry for each margin; None for K answers of which
-            none was.
+            none could be, unless a tie threshold is given.
 
         Raises:
           ValueError: an `indifferent` that is not a vector of bool.
@@ -76,7 +76,7 @@ class PreferenceModel:
         tied = np.zeros(number_of_preferences, dtype=bool) if indifferent is None else np.asarray(indifferent)
         if tied.ndim != 1 or tied.dtype != bool:
             raise ValueError(f"indifferent: expected a vector of bool, got {tied.dtype} of shape {tied.shape}")
-        threshold = self.tie_threshold is not None or bool(np.any(tied))
+        threshold = self.tie_threshold is not None or indifferent is not None
         return likelihood_of(
             self.likelihood,
             float(max(number_of_preferences, 1)),

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from bayespbrl.features import RadialBasis, StateFeatures
 
 # The prior: a uniform distribution over these multiples of the bandwidths as given, in each dimension.
-MULTIPLES = (0.5, 1.4, 4.0)
+MULTIPLES = (1.0, 3.0, 9.0)
 MOST_SETTINGS = 27  # beyond three dimensions, so many points of the grid: the equal ones, and others at random
 
 

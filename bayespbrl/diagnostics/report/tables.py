@@ -1,6 +1,7 @@
 """The tables of a report, each an xarray data set: iterations, answers, the utility of states, trajectories."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -134,7 +135,9 @@ def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
     if isinstance(estimate, PosteriorUtility):
         _, draws = estimate.utilities_and_draws(shown, number=DRAWS)
         chosen = np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)
-        data["mean"], data["sd"] = ("state", draws.mean(axis=0)), ("state", draws.std(axis=0))
+        parts = np.atleast_2d(estimate.posterior["utility_weights_mean"]) / estimate.scales[:, None]
+        data["mean"] = ("state", replace(estimate, weights=parts).utilities(shown))
+        data["sd"] = ("state", draws.std(axis=0))
         data["draws"] = (("draw", "state"), draws[chosen])
         data["prior_sd"] = ("state", estimate.prior_deviations(shown))
     return xr.Dataset(data, attrs=attrs)

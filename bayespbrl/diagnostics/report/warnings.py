@@ -139,8 +139,8 @@ def _of_predictions(scores: xr.Dataset) -> Iterator[ReportWarning]:
         yield ReportWarning(
             "The predictions were overconfident: their log score is more than two standard deviations below its "
             "expectation.",
-            "Leave length scales, lapse rate and steepness to be inferred (--hyperparameters inferred), if they were set. "
-            "Else the features cannot express what matters.",
+            "Leave length scales, lapse rate and steepness to be inferred (--hyperparameters inferred), if they were "
+            "set. Else the features cannot express what matters.",
         )
 
 
