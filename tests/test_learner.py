@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -12,9 +13,11 @@ from toys import Slope, fingerprint
 
 from bayespbrl import Answer, Learner, ReturnExpert, load, queries, resume, rollouts, start
 from bayespbrl import learner as learner_module
+from bayespbrl.diagnostics.estimates import first_preferred_probability
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.improvement.update import NEARLY
+from bayespbrl.models import restored, stored
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
 
@@ -115,7 +118,7 @@ def test_the_rules_ask_about_the_trajectory_whose_score_is_highest():
                 new, (question,) = run.trajectories[-10:], questions
                 draws = run.estimate.trajectory_draws([*new, run.trajectories[question.incumbent]], number=500)
                 if score is None:
-                    likelihood = run.estimate.likelihood
+                    likelihood = run.estimate.likelihood(500)
                     scores = queries.expected_information(draws[:, :-1], draws[:, -1], likelihood=likelihood)
                 else:
                     scores = score(draws[:, :-1], draws[:, -1])
@@ -199,6 +202,34 @@ def test_what_the_schedule_said_decides_whether_to_ask(signal, converged, asks):
     )
     assert last.preferences.answers == 1
     assert bool(again.ask()) == asks
+
+
+def test_bound_question_and_prediction_are_all_of_the_runs_one_posterior():
+    run, log = remembered(schedule="confidence", query="probably-better", utility="posterior-mean", iterations=3)
+    while run.state.iteration < 2:
+        run.tell([ReturnExpert()(*query.trajectories) for query in run.ask()])
+    (question,) = run.ask()
+    kept = run.estimate
+    tree = stored(kept.posterior)
+    for name in ("coordinates", "margins"):
+        tree["posterior"][name] = -tree["posterior"][name]
+    turned = replace(kept, posterior=restored(tree))  # every draw says the opposite, all else is as it was
+
+    steps, new = transitions(run.trajectories[:-10]), range(len(run.trajectories) - 10, len(run.trajectories))
+    bounds, orders, predicted = [], [], []
+    for estimate in (kept, turned):
+        bounds.append(run._update(estimate, steps)[1])
+        incumbent = run.preferences.undominated[-1]
+        shown = run.state.shown - {question.newcomer}
+        situation = queries.QuerySituation(new, run.trajectories, shown, incumbent, estimate, None, run._rng(1, 2))
+        orders.append(queries.candidates(run.query_rule, situation))
+        predicted.append(first_preferred_probability(estimate, *question.trajectories))
+    assert bounds[0].statistics["agreement"] > 0.5 > bounds[1].statistics["agreement"]
+    collected = [entry.event for entry in log.entries if entry.event["event"] == "collected"]
+    assert list(orders[0]) == collected[-1]["candidates"]
+    assert orders[1] != orders[0]
+    assert predicted[1] == pytest.approx(1 - predicted[0], abs=1e-9)
+    assert abs(predicted[0] - 0.5) > 0.01
 
 
 @pytest.mark.slow

@@ -32,8 +32,8 @@ RUN_OPTIONS = {
     "thompson, information, disagreement or information-when-unsure.",
     "schedule": "KL bound of each update: constant (the paper's), or confidence, which scales it with the posterior's "
     "confidence that the update is an improvement.",
-    "hyperparameters": "Length scales, steepness and lapse rate: evidence (by marginal likelihood), averaged (over "
-    "length scales and steepness, weighted by marginal likelihood) or given (as set).",
+    "hyperparameters": "Length scales, steepness and lapse rate: inferred (part of the posterior, unless --steepness or "
+    "--lapse-rate sets one) or given (as set, or the paper's).",
     "iterations": "Number of cycles of the four steps.",
     "kl_bound": "KL bound of each policy update, in nats.",
     "updates_per_iteration": "Maximum number of policy updates per iteration; the paper's is 1.",
@@ -41,8 +41,10 @@ RUN_OPTIONS = {
     "far); with the schedule confidence only while its confidence is high; the paper's is 0.",
     "likelihood": "Likelihood of an answer: mixed (eq. 8), logistic or probit.",
     "prior_scale": "Prior standard deviation of each utility weight.",
-    "steepness": "Steepness of the likelihood, for feature differences scaled to at most 1.",
-    "lapse_rate": "Share of answers modelled as coin tosses, in [0, 1).",
+    "steepness": "Steepness of the likelihood, for feature differences of root mean square length 1; inferred if "
+    "omitted, or 5 with --hyperparameters given.",
+    "lapse_rate": "Share of answers modelled as coin tosses, in [0, 1); inferred if omitted, or 0 with "
+    "--hyperparameters given.",
     "discount": "Discount of Q, in [0, 1); the paper's is 0.98.",
     "trajectory_discount": "Discount of the trajectory features, in [0, 1]; the paper's is that of Q.",
     "wrong_answers": "Share of the simulated expert's answers that are reversed, in [0, 1].",
