@@ -14,6 +14,7 @@ from bayespbrl.models.likelihoods import (
     log_prob,
     total_log_prob,
 )
+from bayespbrl.models.priors import LAPSE_RATE, STEEPNESS, TIE_THRESHOLD
 
 ALL = [
     Mixed(5.0, 7.0),
@@ -118,13 +119,15 @@ def test_a_preference_model_names_its_likelihood():
     tied = np.array([True, False])
     assert PreferenceModel(steepness=3).answer_likelihood(2) == Mixed(3.0, 2.0)
     assert PreferenceModel().answer_likelihood(0) == Mixed(5.0, 1.0)
-    assert PreferenceModel(likelihood="logistic").answer_likelihood(2, np.zeros(2, dtype=bool)) == Logistic(5.0)
+    assert PreferenceModel(likelihood="logistic").answer_likelihood(2) == Logistic(5.0)
     lapsing = PreferenceModel(likelihood="probit", lapse_rate=0.1, tie_threshold=0.2)
     with_ties = lapsing.answer_likelihood(2, tied)
     assert (with_ties.ordered, with_ties.threshold) == (WithLapses(Probit(5.0), 0.1), 0.2)
     np.testing.assert_array_equal(with_ties.indifferent, tied)
     np.testing.assert_array_equal(lapsing.answer_likelihood(3).indifferent, np.zeros(3, dtype=bool))
-    with pytest.raises(ValueError, match="tie_threshold: expected a number > 0"):
-        PreferenceModel().answer_likelihood(2, tied)
+    # what is not given is at its prior's mean
+    inferred = PreferenceModel(steepness=None, lapse_rate=None).answer_likelihood(2, tied)
+    assert inferred.threshold == pytest.approx(TIE_THRESHOLD.mean)
+    assert (inferred.ordered.attentive.steepness, inferred.ordered.lapse_rate) == (STEEPNESS.mean, LAPSE_RATE.mean)
     with pytest.raises(ValueError, match="indifferent: expected a vector of bool"):
         lapsing.answer_likelihood(2, np.zeros(2))

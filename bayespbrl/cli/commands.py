@@ -32,8 +32,8 @@ RUN_OPTIONS = {
     "thompson, information, disagreement or information-when-unsure.",
     "schedule": "KL bound of each update: constant (the paper's), or confidence, which scales it with the posterior's "
     "confidence that the update is an improvement.",
-    "hyperparameters": "Length scales, steepness and lapse rate: inferred (part of the posterior, unless --steepness or "
-    "--lapse-rate sets one) or given (as set, or the paper's).",
+    "hyperparameters": "Length scales, steepness and lapse rate: inferred (part of the posterior, unless --steepness "
+    "or --lapse-rate sets one) or given (as set, or the paper's).",
     "iterations": "Number of cycles of the four steps.",
     "kl_bound": "KL bound of each policy update, in nats.",
     "updates_per_iteration": "Maximum number of policy updates per iteration; the paper's is 1.",
