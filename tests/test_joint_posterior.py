@@ -2,12 +2,27 @@
 
 import itertools
 
+import jax
 import numpy as np
 import pytest
+from numpyro.infer.util import log_density
+from scipy import stats
 from scipy.special import expit, logsumexp
 
-from bayespbrl.models import priors, sample_posterior
-from bayespbrl.models.convergence import chain_convergence
+from bayespbrl.models import (
+    Answers,
+    PreferenceModel,
+    fit_gaussian,
+    joint_preference_model,
+    posterior_draws,
+    priors,
+    sample_posterior,
+)
+from bayespbrl.models.chains import Chains
+from bayespbrl.models.convergence import Convergence, chain_convergence
+from bayespbrl.models.gibbs import conditional
+from bayespbrl.models.posterior import SamplerOptions
+from bayespbrl.models.posterior_tree import bases_of
 
 INFERRED = {"steepness": None, "lapse_rate": None}
 SETTINGS = np.array([[[0.9], [0.4], [-0.2], [0.7]], [[0.1], [0.8], [1.3], [-0.3]]])
@@ -118,3 +133,58 @@ def test_a_side_bias_and_two_answerers_agree_with_quadrature():
     sides, answerers = np.array([1, -1, 1, 1]), np.array([0, 1, 1, 0])
     tree = sample_posterior(SETTINGS[:1], **INFERRED, shown_first=sides, answerers=answerers, **SAMPLING)
     agree(tree, quadrature(SETTINGS[:1], sides=sides, answerers=answerers)[0])
+
+
+def test_the_sampled_density_is_that_of_the_numpyro_model_named_in_the_documentation():
+    answers = Answers(np.array([False, True, False, False]), np.array([1, -1, 1, 0]), np.array([0, 1, 1, 0]))
+    model = PreferenceModel(prior_scale=1.3, steepness=None, lapse_rate=None)
+    tree = posterior_draws(SETTINGS, model, seed=1, answers=answers, sampler=SamplerOptions(25, 25, 25))
+    drawn, bases = tree["posterior"].dataset, bases_of(tree)
+    grids = {"steepness": model.steepness_prior, "lapse_rate": model.lapse_rate_prior}
+    grids["tie_threshold"] = model.tie_threshold_prior
+    for chain, draw in ((0, 3), (1, 24), (3, 11)):
+        one = drawn.isel(chain=chain, draw=draw)
+        basis = bases[int(one["setting"])]
+        z = one["coordinates"].values[: basis.shape[1]]
+        values = {"setting": int(one["setting"]), "utility_weights": basis @ z}
+        for name, grid in grids.items():
+            values[f"{name}_number"] = np.searchsorted(grid.values, one[name].values)
+        with jax.enable_x64(True):
+            arguments = (SETTINGS, model), {"answers": answers}
+            log_joint, sites = log_density(joint_preference_model, *arguments, values)
+            of_answers = _answers_of(sites)
+        np.testing.assert_allclose(float(tree["sample_stats/lp"][chain, draw]), of_answers, atol=1e-6)
+        prior = -np.log(2) + sum(np.log(grids[n].probabilities[values[f"{n}_number"]]).sum() for n in grids)
+        prior += stats.norm(scale=1.3).logpdf(values["utility_weights"]).sum()
+        np.testing.assert_allclose(float(log_joint), of_answers + prior, atol=1e-5)
+
+
+def _answers_of(sites):
+    return float(np.sum(sites["answers"]["fn"].log_prob(sites["answers"]["value"])))
+
+
+def test_chains_start_apart_in_all_that_is_unknown():
+    fits = [fit_gaussian(each, PreferenceModel(steepness=None, lapse_rate=None)) for each in SETTINGS]
+    with jax.enable_x64(True):
+        chains = Chains.start(fits, num_chains=200, chunk=25, seed=0)
+        one = conditional(chains.problem, jax.tree.map(lambda x: x[0], chains.unknowns))
+    settings, steepness, lapse_rate, _ = map(np.asarray, chains.unknowns)
+    assert 0.2 < np.mean(settings) < 0.8
+    assert len(np.unique(steepness)) == len(priors.STEEPNESS.values)
+    assert np.mean(lapse_rate == 0) == pytest.approx(0.5, abs=0.15)
+    z = np.asarray(chains.state.z["utility_weights"])[settings == settings[0]]
+    whitened = (z - np.asarray(one.centre)) @ np.asarray(one.inverse_root).T
+    assert stats.kstest(whitened[:, 0], stats.norm.cdf).pvalue > 1e-3
+    assert stats.kstest(whitened[:, 5], stats.norm.cdf).pvalue > 1e-3
+
+
+def test_what_no_answer_touches_keeps_the_prior_scale():
+    tree = sample_posterior(np.array([[1.0, 0.0, 0.0]]), prior_scale=2.0, num_samples=500, max_samples=500)
+    weights = tree["posterior/utility_weights"].values[:, :, 1:]
+    assert stats.kstest(weights.ravel(), stats.norm(scale=2.0).cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("rhat", "size", "fine"), [(1.009, 401, True), (1.02, 401, False), (1.009, 390, False)])
+def test_the_limits_of_convergence_are_those_of_vehtari_and_others(rhat, size, fine):
+    report = Convergence(np.array([1.0, rhat]), np.array([1e4, size]), np.zeros(2))
+    assert report.converged() == fine

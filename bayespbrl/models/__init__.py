@@ -20,7 +20,13 @@ from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian
 from bayespbrl.models.linear_program import LinearProgramResult, linear_program
 from bayespbrl.models.posterior import posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import restored, stored
-from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel, preference_model
+from bayespbrl.models.preference_model import (
+    NOTHING_ELSE,
+    Answers,
+    PreferenceModel,
+    joint_preference_model,
+    preference_model,
+)
 
 __all__ = [
     "NOTHING_ELSE",
@@ -30,6 +36,7 @@ __all__ = [
     "LinearProgramResult",
     "PreferenceModel",
     "fit_gaussian",
+    "joint_preference_model",
     "linear_program",
     "posterior_draws",
     "preference_model",

@@ -1,4 +1,4 @@
-"""Chains on everything that is unknown, by one compiled sampler for each capacity: Gibbs moves, and elliptical slices."""
+"""Chains on everything that is unknown: Gibbs moves and elliptical slices, by one compiled sampler a capacity."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

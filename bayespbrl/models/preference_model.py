@@ -157,3 +157,46 @@ def preference_model(
     with numpyro.plate("preference", number), numpyro.handlers.mask(mask=used):
         logits = log_p - jnp.log(-jnp.expm1(log_p))
         numpyro.sample("answers", dist.Bernoulli(logits=logits), obs=jnp.ones(number, dtype=int))
+
+
+def joint_preference_model(
+    differences: Float[np.ndarray, "s k d"],
+    model: PreferenceModel,
+    *,
+    answers: Answers = NOTHING_ELSE,
+    number_of_preferences: int | None = None,
+) -> None:
+    """The model of `sample_posterior` with everything that it infers: its priors, and `preference_model` given them.
+
+    Sites: `setting`, and `steepness_number`, `lapse_rate_number` (one for each answerer, plate "answerer") and
+    `tie_threshold_number`, the numbers of the values on their grids; then those of `preference_model`, whose
+    `utility_weights` have one feature more where `shown_first` is known: the side.
+
+    Args:
+      differences: for C settings, equally probable a priori.
+      model: prior and likelihood.
+      answers: ties, sides and answerers.
+      number_of_preferences: K of eq. 8; all rows by default.
+    """
+    settings = jnp.asarray(answers.with_sides(differences, model.prior_scale))
+    number = settings.shape[1] if number_of_preferences is None else number_of_preferences
+    who = np.zeros(settings.shape[1], int) if answers.answerers is None else np.asarray(answers.answerers)
+
+    def one_of(name: str, prior: Grid) -> Array:
+        chosen = numpyro.sample(f"{name}_number", dist.Categorical(jnp.asarray(prior.probabilities)))
+        return numpyro.deterministic(name, jnp.asarray(prior.values)[chosen])
+
+    setting = numpyro.sample("setting", dist.Categorical(jnp.full(len(settings), 1 / len(settings))))
+    steepness = one_of("steepness", model.steepness_prior)
+    with numpyro.plate("answerer", int(who.max(initial=0)) + 1):
+        lapse_rates = one_of("lapse_rate", model.lapse_rate_prior)
+    ties = answers.indifferent is not None or model.tie_threshold is not None
+    likelihood = likelihood_of(
+        model.likelihood,
+        float(max(number, 1)),
+        steepness=steepness,
+        lapse_rate=None if model.lapse_rate == 0 else lapse_rates[who],
+        tie_threshold=one_of("tie_threshold", model.tie_threshold_prior) if ties else None,
+        indifferent=np.zeros(len(who), bool) if answers.indifferent is None else np.asarray(answers.indifferent),
+    )
+    preference_model(settings[setting], likelihood, prior_scale=model.prior_scale)
