@@ -9,7 +9,6 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import gymnasium
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -189,17 +188,19 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(g
     parts = read_iteration(gridworld_run / "iterations" / "0002.nc", "improved")
     both = [run.trajectories[asked[name]] for name in ("first", "second")]
     sums = trajectory_features(both, parts["estimate"].features, discount=run.settings.critic.discount)
-    difference = (sums[[0]] - sums[[1]]) / parts["estimate"].scale
+    difference = (sums[[0]] - sums[[1]]) / parts["estimate"].scales[0]
     expected = answer_probabilities(parts["estimate"].posterior, difference)[0, 0 if said == "first" else 1]
     assert float(table["before"][3]) == pytest.approx(expected)
-    assert float(table["probability"][3]) == pytest.approx(likelihood[-1])
+    assert float(table["probability"][3]) == pytest.approx(
+        likelihood[len(run.preferences.pairs) - 1]
+    )  # the ties come last
     utilities = run.estimate.trajectory_utilities(both)
     margin = (utilities[0] - utilities[1]) * (1 if said == "first" else -1)
     assert float(table["margin"][3]) == pytest.approx(margin, rel=1e-6)  # in the units of the utility
 
 
 @pytest.mark.slow
-def test_the_answers_have_the_probabilities_of_an_averaged_utility(swing_up_run):
+def test_the_answers_have_the_probabilities_of_the_posterior_over_all_length_scales(swing_up_run):
     run, contents = bayespbrl.load(swing_up_run), read_contents(swing_up_run)
     table = report_tables.answers_table(contents)
     later = [k for k, answer in enumerate(contents.answers) if answer.iteration > 1]
@@ -209,19 +210,38 @@ def test_the_answers_have_the_probabilities_of_an_averaged_utility(swing_up_run)
         before = read_iteration(run.path / "iterations" / f"{answer.iteration - 1:04d}.nc", "improved")["estimate"]
         numbers = (answer.first, answer.second)[:: 1 if str(answer.answer) == "first" else -1]
         both = [run.trajectories[number] for number in numbers]
-        for name, estimate in (("before", before), ("probability", run.estimate)):
-            margins = -np.diff(estimate.trajectory_draws(both))[:, 0]
-            expected = np.exp(log_prob(estimate.likelihood, jnp.asarray(margins))).mean()
-            assert float(table[name][k]) == pytest.approx(float(expected), abs=1e-4)
+        for name, estimate, rounding in (("before", before, 0.02), ("probability", run.estimate, 1e-4)):
+            margins = estimate.margin_draws(*both)
+            p = np.exp(log_prob(estimate.likelihood(), margins[:, None])).mean()
+            assert float(table[name][k]) == pytest.approx(float(p), abs=rounding)
         assert float(table["margin"][k]) == pytest.approx(margins.mean(), rel=1e-6)
         assert float(table["margin_sd"][k]) == pytest.approx(margins.std(), rel=1e-6)
-        of_one_setting.append(float(np.mean(np.diff(before.sampled.trajectory_draws(both)) < 0)))
+        numbers = before.posterior["posterior"]["setting"].values.ravel()
+        likeliest = numbers == np.bincount(numbers).argmax()
+        margins = before.margin_draws(*both)
+        of_one_setting.append(float(np.mean(margins[likeliest] > 0)))
     assert np.abs(table["before"].values[later] - of_one_setting).max() > 0.03  # else this could not distinguish them
-    assert "gives the answers their probabilities" in read(write_report(swing_up_run)).text
 
 
 @pytest.mark.slow
-def test_a_run_keeps_the_average_and_the_report_says_what_it_is_over(swing_up_learner):
+def test_the_probability_of_an_answer_before_it_was_given_is_of_the_posterior_that_the_run_kept(gridworld_copy):
+    table = report_tables.answers_table(read_contents(gridworld_copy))
+    log = [json.loads(line) for line in (gridworld_copy / "events.jsonl").read_text().splitlines()]
+    said = [event for event in log if event["event"] == "answered"][-1]["answer"]
+    contents = read_contents(gridworld_copy)
+    tree = contents.posterior
+    tree["posterior"]["coordinates"][:] = 0.0  # a posterior that knows nothing of what was asked
+    tree["posterior"]["margins"][:] = 0.0
+    tree["log_likelihood"]["answers"][:] = np.log(0.5)
+    other = report_tables.answers_table(contents)
+    assert said in ("first", "second")
+    assert abs(float(table["probability"][3]) - 0.5) > 0.05
+    assert float(other["probability"][3]) == pytest.approx(0.5)
+    assert float(other["margin"][3]) == 0
+
+
+@pytest.mark.slow
+def test_a_run_keeps_the_posterior_over_length_scales_and_the_report_says_what_it_is_over(swing_up_learner):
     directory, learner = swing_up_learner
     estimate = read_iteration(directory / "iterations" / "0004.nc", "improved")["estimate"]
     states = learner.trajectories[0].states
@@ -231,8 +251,14 @@ def test_a_run_keeps_the_average_and_the_report_says_what_it_is_over(swing_up_le
         estimate.utilities_and_draws(states), learner.estimate.utilities_and_draws(states), strict=True
     ):
         np.testing.assert_array_equal(kept, learned)
-    report = write_report(directory).read_text()
-    assert f"an average over {len(estimate.multiples)} choices of length scales" in report
+    text = read(write_report(directory)).text
+    assert f"The posterior is over {len(estimate.multiples)} choices of length scales as well" in text
+    found = learner.estimate.hyperparameters()
+    for name in ("lapse_rate", "steepness"):
+        low, high = (number(found[f"{name} {end}"]) for end in ("lower", "upper"))
+        assert f"{name.replace('_', ' ')}: {number(found[name])} ({low} to {high})" in text.lower()
+    assert learner.iterations[-1]["hyperparameters"] == found
+    assert "What was inferred beside the weights" in text
 
 
 def test_few_predictions_are_no_ground_for_a_warning(contents):
@@ -255,9 +281,9 @@ def test_the_utility_of_states_is_that_of_the_estimate_with_the_spread_of_its_dr
     assert (table.attrs["kind"], table.attrs["shape"]) == ("grid", (5, 5))
     np.testing.assert_allclose(table["used"], run.estimate.utilities(np.arange(25)))
     np.testing.assert_allclose(table["mean"], table["used"])
-    draws = run.estimate.draws(np.eye(25))
-    np.testing.assert_allclose(table["sd"], draws.std(axis=(0, 1)), rtol=0.15)
-    np.testing.assert_allclose(table["prior_sd"], run.settings.model.prior_scale / run.estimate.scale)
+    _, draws = run.estimate.utilities_and_draws(np.arange(25))
+    np.testing.assert_allclose(table["sd"], draws.std(axis=0), rtol=0.15)
+    np.testing.assert_allclose(table["prior_sd"], run.settings.model.prior_scale / run.estimate.scales[0])
     assert int(table["visits"].sum()) == sum(len(trajectory.states) for trajectory in run.trajectories)
     assert table.sizes["draw"] == 3
 
