@@ -279,13 +279,9 @@ class Learner:
         """Step 1."""
         state, settings = self.state, self.settings
         rng = self._rng(FEATURES, 2 * state.iteration)
+        pairs, ties = state.preferences.pairs, state.preferences.ties
         return estimate(
-            Comparisons.among(
-                state.trajectories,
-                state.preferences.pairs,
-                discount=settings.trajectory_discount,
-                ties=state.preferences.ties,
-            ),
+            Comparisons.among(state.trajectories, pairs, ties=ties, discount=settings.trajectory_discount),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),
             settings.estimation,
             settings.model,

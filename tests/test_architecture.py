@@ -19,7 +19,7 @@ ROOMS = {
     "models": ["models"],
     "policies": ["policies"],
     "what flows round": ["trajectories", "features", "preferences", "experts"],
-    "estimate": ["utility.estimate", "utility.posterior_utility", "utility.quality"],
+    "estimate": ["utility.estimate", "utility.length_scales", "utility.posterior_utility", "utility.quality"],
     "step 1": ["utility"],
     "step 2": ["improvement"],
     "step 3": ["rollouts"],
