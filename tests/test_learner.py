@@ -620,10 +620,10 @@ def test_compilations_of_the_sampler_grow_with_its_capacity_only():
     jax.clear_caches()  # or what other tests compiled would not be counted here
     many = {"utility": "posterior-mean", "iterations": 5, "first_queries": 9, "queries_per_iteration": 9}
     run = learner(**many)
-    assert 0 < compilations_after(run, 3) <= 8
+    assert 0 < compilations_after(run, 3) <= 9  # eight for the chains, one for the evidence
     assert len(run.preferences.pairs) > 32
     assert compilations_after(learner(**many), 0) == 0
-    assert compilations_after(learner(utility="posterior-mean", iterations=8), 3) <= 8
+    assert compilations_after(learner(utility="posterior-mean", iterations=8), 3) <= 9
     assert compilations_after(learner(utility="posterior-mean", iterations=8), 0) == 0
 
 

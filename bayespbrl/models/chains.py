@@ -91,9 +91,8 @@ class Chains:
             drawn(problem.lapse_rate, len(problem.answerers)),
             drawn(problem.tie_threshold),
         )
-        one = jax.vmap(conditional, (None, 0))(problem, unknowns)
-        noise = jnp.asarray(rng.standard_normal(one.centre.shape))
-        start = one.centre + jnp.einsum("cij,cj->ci", one.root, noise)
+        centres, roots = np.asarray(problem.settings.centre)[setting], np.asarray(problem.settings.root)[setting]
+        start = jnp.asarray(centres + np.einsum("cij,cj->ci", roots, rng.standard_normal(centres.shape)))
         zeros = jnp.zeros(num_chains)
         no = zeros.astype(bool)
         keys = jax.random.split(jax.random.key(seed), num_chains)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.special import logsumexp
 
 from bayespbrl.models.chains import Chains
@@ -28,18 +28,22 @@ def log_evidence(chains: Chains, length: int, *, seed: int) -> tuple[float, floa
     """
     if chains.number == 0:
         return 0.0, 0.0
-    number_of_chains = chains.state.candidates.shape[0]
-    apart = -(-number_of_chains * length // NUMBER)
-    drawn = Unknowns(*(jnp.asarray(chains.collected(name, length)[:, ::apart]) for name in Unknowns._fields))
-    z = chains.collected("coordinates", length)[:, ::apart]
-    rank = chains.problem.settings.centre.shape[1]
-    padding = np.random.default_rng([seed, 3]).standard_normal((*z.shape[:2], rank - z.shape[2]))
-    z = np.concatenate([z, np.asarray(chains.problem.settings.prior_scale) * padding], axis=2)
+    z = chains.collected("coordinates", length)
+    each = np.linspace(0, length - 1, NUMBER // z.shape[0]).round().astype(int)  # as many, however long the chains are
+    rank, rng = chains.problem.settings.centre.shape[1], np.random.default_rng([seed, 3])
+    scale = float(chains.problem.settings.prior_scale)
+    padding = scale * rng.standard_normal((z.shape[0], len(each), rank - z.shape[2]))
+    z = np.concatenate([z[:, each], padding], axis=2)
+    drawn = [chains.collected(name, length)[:, each] for name in Unknowns._fields]
+    proposed, of_proposal = _proposed(chains.problem, rng)
+    rows = z.shape[0] * len(each)
+    together = [np.concatenate([a.reshape(rows, *a.shape[2:]), b]) for a, b in zip(drawn, of_proposal, strict=True)]
     with jax.enable_x64(True):
-        of_posterior = np.asarray(_every_log_ratio(chains.problem, jnp.asarray(z), drawn))
-        of_proposal = np.asarray(_every_log_ratio(chains.problem, *_proposed(chains.problem, seed)))
-    relative = float(np.min(chain_convergence(of_posterior[..., None]).effective_sample_size)) / of_posterior.size
-    return _bridged(of_posterior.ravel(), of_proposal, min(relative, 1.0))
+        points = np.concatenate([z.reshape(rows, rank), proposed])
+        ratios = np.asarray(_log_ratios(chains.problem, jnp.asarray(points), Unknowns(*map(jnp.asarray, together))))
+    of_posterior = ratios[:rows].reshape(z.shape[:2])
+    relative = float(np.min(chain_convergence(of_posterior[..., None]).effective_sample_size)) / rows
+    return _bridged(ratios[:rows], ratios[rows:], min(relative, 1.0))
 
 
 def _bridged(
@@ -59,28 +63,35 @@ def _bridged(
     return estimate, float(np.sqrt(sum(errors)))
 
 
-def _proposed(problem: JointProblem, seed: int) -> tuple[Float[Array, "n q"], Unknowns]:
-    rng = np.random.default_rng([seed, 4])
+def _proposed(
+    problem: JointProblem, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n q"], list[Int[np.ndarray, "n ..."]]]:
+    """Draws of the weights and of the unknowns from the proposal."""
 
-    def drawn(log_probabilities: Array, *shape: int) -> Array:
+    def drawn(log_probabilities: Array, *shape: int) -> np.ndarray:
         probabilities = np.exp(np.asarray(log_probabilities, dtype=np.float64))
-        return jnp.asarray(rng.choice(len(probabilities), (NUMBER, *shape), p=probabilities / probabilities.sum()))
+        return rng.choice(len(probabilities), (NUMBER, *shape), p=probabilities / probabilities.sum())
 
-    unknowns = Unknowns(
-        drawn(problem.log_probabilities),
+    setting = drawn(problem.log_probabilities)
+    unknowns = [
+        setting,
         drawn(problem.steepness.log_probabilities),
         drawn(problem.lapse_rate.log_probabilities, len(problem.answerers)),
         drawn(problem.tie_threshold.log_probabilities),
+    ]
+    points, noise = (
+        np.array(problem.settings.centre)[setting],
+        rng.standard_normal((NUMBER, problem.settings.centre.shape[1])),
     )
-    noise = jnp.asarray(rng.standard_normal((NUMBER, problem.settings.centre.shape[1])))
-    settings = problem.settings
-    roots = settings.root[unknowns.setting]
-    return settings.centre[unknowns.setting] + jnp.einsum("nij,nj->ni", roots, noise), unknowns
+    for number, root in enumerate(np.asarray(problem.settings.root)):
+        chosen = setting == number
+        points[chosen] += noise[chosen] @ root.T
+    return points, unknowns
 
 
 @jax.jit
-def _every_log_ratio(problem: JointProblem, z: Float[Array, "*n q"], unknowns: Unknowns) -> Float[Array, "*n"]:
-    """log (prior × likelihood / proposal); the priors of all but the weights cancel."""
+def _log_ratios(problem: JointProblem, z: Float[Array, "n q"], unknowns: Unknowns) -> Float[Array, " n"]:
+    """log (prior × likelihood / proposal) of each; the priors of all but the weights cancel."""
 
     def one(z: Float[Array, " q"], unknowns: Unknowns) -> Float[Array, ""]:
         given, real = conditional(problem, unknowns), problem.answerers.sum(axis=0) > 0
@@ -90,6 +101,4 @@ def _every_log_ratio(problem: JointProblem, z: Float[Array, "*n q"], unknowns: U
         log_p += 0.5 * jnp.sum(whitened**2) - 0.5 * jnp.sum(z**2) / scale**2 - len(z) * jnp.log(scale)
         return log_p + jnp.sum(jnp.log(jnp.diagonal(given.root)))
 
-    for _ in range(z.ndim - 1):
-        one = jax.vmap(one)
-    return one(z, unknowns)
+    return jax.vmap(one)(z, unknowns)
