@@ -31,13 +31,13 @@ class Estimation:
       utility: the method, one of `METHODS`; `known-reward` is the hidden reward itself, for reference runs.
       hyperparameters: `inferred`: the length scales of the features are part of the posterior, and so are steepness and
         lapse rate unless they are set; `given` keeps all.
-      trajectory_discount: γ of ψ(τ) in the answers; None for the critic's, as in the paper; 1 for an expert who judges
-        whole trajectories.
+      trajectory_discount: γ of ψ(τ) in the answers; 1 for an expert who judges whole trajectories; None for the
+        critic's, as in the paper.
     """
 
     utility: str = "posterior-mean"
     hyperparameters: str = "inferred"
-    trajectory_discount: float | None = None
+    trajectory_discount: float | None = 1.0
 
     def __post_init__(self) -> None:
         checks.one_of("utility", self.utility, METHODS)
