@@ -3,10 +3,11 @@
     python benchmarks/simulation_based_calibration.py --runs 300 --jobs 2 [--ties] [--bug NAME] [--out FILE.csv]
 
 In each run everything is drawn from the prior of the model: setting of the features, weights, steepness, lapse rate,
-and with `--ties` the tie threshold. An answerer simulated by them answers questions about pairs of items that the posterior of the answers so
-far chooses, those of highest expected information, until that is below a limit or there are ten answers. The rank of
-each true value among the draws of the last posterior must then be uniform (Talts et al. 2018), whatever was asked and
-whenever it ended. Eq. 8 is given its K beforehand, because the probability of an answer depends on it.
+and with `--ties` the tie threshold. An answerer simulated by them answers questions about pairs of items that the
+posterior of the answers so far chooses, those of highest expected information, until that is below a limit or there are
+ten answers. The rank of each true value among the draws of the last posterior must then be uniform (Talts et al. 2018),
+whatever was asked and whenever it ended. Eq. 8 is given its K beforehand, because the probability of an answer depends
+on it.
 
 Printed are, for each functional, the p-value of uniformity (χ², ten bins) and the smallest times their number
 (Bonferroni). `--bug` plants one that must be rejected: `no-setting` (the setting is never moved), `no-volume` (its move
