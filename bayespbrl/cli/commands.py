@@ -46,8 +46,8 @@ RUN_OPTIONS = {
     "lapse_rate": "Share of answers modelled as coin tosses, in [0, 1); inferred if omitted, or 0 with "
     "--hyperparameters given.",
     "discount": "Discount of Q, in [0, 1); the paper's is 0.98.",
-    "trajectory_discount": "Discount of the trajectory features, in [0, 1]: 1, the default, where whole trajectories are "
-    "judged; the paper's is that of Q.",
+    "trajectory_discount": "Discount of the trajectory features, in [0, 1]: 1, the default, where whole trajectories "
+    "are judged; the paper's is that of Q.",
     "wrong_answers": "Share of the simulated expert's answers that are reversed, in [0, 1].",
     "policy": "Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.",
     "centres": "Number of radial basis functions of each kind of feature.",
