@@ -661,3 +661,12 @@ def test_a_run_follows_a_query_rule_of_the_users_own_and_goes_on_with_it(tmp_pat
     assert load(tmp_path / "run").iterations == whole.iterations  # reading needs no rule
     with pytest.raises(ValueError, match="query: expected a function of the user's own beside 'other', got none"):
         Learner("gridworld", query="other")
+
+
+def test_exploration_is_held_for_as_many_steps_as_the_settings_say(monkeypatch):
+    held, rollout = [], rollouts.rollout
+    monkeypatch.setattr(
+        rollouts, "rollout", lambda *a, **options: held.append(options["hold"]) or rollout(*a, **options)
+    )
+    learner(iterations=2, exploration_hold=4).run(ReturnExpert())
+    assert held == [4, 4]
