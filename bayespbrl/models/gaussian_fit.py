@@ -54,6 +54,8 @@ def fit_gaussian(
     number, dimension = differences.shape
     if dimension == 0:
         raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
+    if indifferent is None and model.tie_threshold is not None:
+        indifferent = np.zeros(number, dtype=bool)
     tied = None if indifferent is None else checks.flags("indifferent", indifferent, number)
     likelihood = model.answer_likelihood(number if number_of_preferences is None else number_of_preferences, tied)
     with one_blas_thread():
