@@ -14,7 +14,7 @@ from scipy.special import softmax
 from bayespbrl.models.elliptical_slice import Ellipse
 from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords, Values
 from bayespbrl.models.gaussian_fit import GaussianFit
-from bayespbrl.models.gibbs import JointProblem, Table, Unknowns, conditional, moved, stacked
+from bayespbrl.models.gibbs import JointProblem, Table, Unknowns, conditional, moved, prior_draws, stacked
 from bayespbrl.models.likelihoods import WithTies, log_prob, total_log_prob
 from bayespbrl.models.low_rank import used_rows
 from bayespbrl.models.preference_problem import (
@@ -78,19 +78,7 @@ class Chains:
         rng = np.random.default_rng(seed)
         # likely settings, but spread wider than the posterior over them: chains that agree have forgotten their start
         setting = rng.choice(len(fits), num_chains, p=softmax([0.5 * fit.log_evidence for fit in fits]))
-
-        def drawn(prior: Table, *shape: int) -> Int[Array, "..."]:
-            probabilities = np.exp(np.asarray(prior.log_probabilities))
-            return jnp.asarray(
-                rng.choice(len(prior.values), (num_chains, *shape), p=probabilities / probabilities.sum())
-            )
-
-        unknowns = Unknowns(
-            jnp.asarray(setting),
-            drawn(problem.steepness),
-            drawn(problem.lapse_rate, len(problem.answerers)),
-            drawn(problem.tie_threshold),
-        )
+        unknowns = Unknowns(*map(jnp.asarray, (setting, *prior_draws(problem, rng, num_chains))))
         centres, roots = np.asarray(problem.settings.centre)[setting], np.asarray(problem.settings.root)[setting]
         start = jnp.asarray(centres + np.einsum("cij,cj->ci", roots, rng.standard_normal(centres.shape)))
         zeros = jnp.zeros(num_chains)

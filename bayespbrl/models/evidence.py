@@ -14,8 +14,7 @@ from scipy.special import logsumexp
 
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import chain_convergence
-from bayespbrl.models.gibbs import JointProblem, Unknowns, conditional
-from bayespbrl.models.likelihoods import log_prob
+from bayespbrl.models.gibbs import JointProblem, Unknowns, conditional, log_likelihood, prior_draws
 
 NUMBER = 1000  # draws of each sample
 ITERATIONS = 30  # the fixed point converges geometrically
@@ -67,22 +66,11 @@ def _proposed(
     problem: JointProblem, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n q"], list[Int[np.ndarray, "n ..."]]]:
     """Draws of the weights and of the unknowns from the proposal."""
-
-    def drawn(log_probabilities: Array, *shape: int) -> np.ndarray:
-        probabilities = np.exp(np.asarray(log_probabilities, dtype=np.float64))
-        return rng.choice(len(probabilities), (NUMBER, *shape), p=probabilities / probabilities.sum())
-
-    setting = drawn(problem.log_probabilities)
-    unknowns = [
-        setting,
-        drawn(problem.steepness.log_probabilities),
-        drawn(problem.lapse_rate.log_probabilities, len(problem.answerers)),
-        drawn(problem.tie_threshold.log_probabilities),
-    ]
-    points, noise = (
-        np.array(problem.settings.centre)[setting],
-        rng.standard_normal((NUMBER, problem.settings.centre.shape[1])),
-    )
+    probabilities = np.exp(np.asarray(problem.log_probabilities, dtype=np.float64))
+    setting = rng.choice(len(probabilities), NUMBER, p=probabilities / probabilities.sum())
+    unknowns = [setting, *prior_draws(problem, rng, NUMBER)]
+    points = np.array(problem.settings.centre)[setting]
+    noise = rng.standard_normal(points.shape)
     for number, root in enumerate(np.asarray(problem.settings.root)):
         chosen = setting == number
         points[chosen] += noise[chosen] @ root.T
@@ -94,8 +82,8 @@ def _log_ratios(problem: JointProblem, z: Float[Array, "n q"], unknowns: Unknown
     """log (prior × likelihood / proposal) of each; the priors of all but the weights cancel."""
 
     def one(z: Float[Array, " q"], unknowns: Unknowns) -> Float[Array, ""]:
-        given, real = conditional(problem, unknowns), problem.answerers.sum(axis=0) > 0
-        log_p = jnp.sum(jnp.where(real, log_prob(given.likelihood, given.loadings @ z), 0))
+        given = conditional(problem, unknowns)
+        log_p = log_likelihood(problem, unknowns, given.loadings @ z)
         whitened = given.inverse_root @ (z - given.centre)
         scale = given.prior_scale
         log_p += 0.5 * jnp.sum(whitened**2) - 0.5 * jnp.sum(z**2) / scale**2 - len(z) * jnp.log(scale)

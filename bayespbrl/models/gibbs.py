@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, random
 from jaxtyping import Float, Int, PRNGKeyArray
 
@@ -71,6 +72,20 @@ def _point(problem: JointProblem, unknowns: Unknowns) -> _Point:
     )
 
 
+def prior_draws(problem: JointProblem, rng: np.random.Generator, number: int) -> list[Int[np.ndarray, "n ..."]]:
+    """Numbers of the values of steepness, lapse rates and tie threshold, `number` draws from the priors of each."""
+
+    def drawn(prior: Table, *shape: int) -> Int[np.ndarray, "n ..."]:
+        probabilities = np.exp(np.asarray(prior.log_probabilities, dtype=np.float64))
+        return rng.choice(len(prior.values), (number, *shape), p=probabilities / probabilities.sum())
+
+    return [
+        drawn(problem.steepness),
+        drawn(problem.lapse_rate, len(problem.answerers)),
+        drawn(problem.tie_threshold),
+    ]
+
+
 def conditional(problem: JointProblem, unknowns: Unknowns) -> PreferenceProblem:
     """The problem of the weights given all else."""
     parts = {name: getattr(problem.settings, name)[unknowns.setting] for name in STACKED}
@@ -104,11 +119,16 @@ def _setting_move(
     whitened = settings.inverse_root[now] @ (z - settings.centre[now])
     points = settings.centre + settings.root @ whitened
     margins = jnp.einsum("skq,sq->sk", settings.loadings, points)
-    log_p = jnp.sum(_log_probabilities(problem, _point(problem, unknowns), margins), axis=1)
+    log_p = log_likelihood(problem, unknowns, margins)
     log_p -= 0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # log N(z; 0, σ²I)
     log_p += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A|
     setting = random.categorical(key, log_p + problem.log_probabilities)
     return points[setting], unknowns._replace(setting=setting)
+
+
+def log_likelihood(problem: JointProblem, unknowns: Unknowns, margins: Margins) -> Values:
+    """Σ log p of the answers, those of padded rows left out."""
+    return jnp.sum(_log_probabilities(problem, _point(problem, unknowns), margins), axis=-1)
 
 
 def _log_probabilities(problem: JointProblem, point: _Point, margins: Margins) -> Values:

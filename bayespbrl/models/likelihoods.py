@@ -247,7 +247,7 @@ def likelihood_of(
       steepness: m.
       lapse_rate: λ; None for no lapses.
       tie_threshold: δ; None for no ties.
-      indifferent: which answers were "no difference".
+      indifferent: which answers were "no difference"; goes with a threshold.
     """
     ordered: Mixed | Logistic | Probit | WithLapses
     if name == "mixed":
@@ -256,11 +256,10 @@ def likelihood_of(
         ordered = (Logistic if name == "logistic" else Probit)(steepness)
     if lapse_rate is not None:
         ordered = WithLapses(ordered, lapse_rate)
-    return (
-        ordered
-        if tie_threshold is None
-        else WithTies(ordered, tie_threshold, np.zeros(0, bool) if indifferent is None else indifferent)
-    )
+    if tie_threshold is None:
+        return ordered
+    assert indifferent is not None
+    return WithTies(ordered, tie_threshold, indifferent)
 
 
 def smoothed_probability(

@@ -93,7 +93,7 @@ def posterior_tree(
             "/constant_data": xr.Dataset({"differences": (dimensions, differences), **known}),
         }
     )
-    return restored(tree)
+    return _with_weights(tree, [fit.factors.basis for fit in fits])
 
 
 def answers_of(tree: xr.DataTree) -> Answers:
@@ -121,7 +121,11 @@ def stored(tree: xr.DataTree) -> xr.DataTree:
 
 def restored(tree: xr.DataTree) -> xr.DataTree:
     """The tree with `posterior["utility_weights"]`, computed where it is indexed, the side bias, and points for all."""
-    bases, posterior = bases_of(tree), tree.children["posterior"].to_dataset(inherit=False)
+    return _with_weights(tree, bases_of(tree))
+
+
+def _with_weights(tree: xr.DataTree, bases: Sequence[Float[np.ndarray, "d _"]]) -> xr.DataTree:
+    posterior = tree.children["posterior"].to_dataset(inherit=False)
     z, settings = posterior["coordinates"].values, posterior["setting"].values
     differences = tree.children["constant_data"].dataset["differences"]
     width, several = differences.shape[-1], differences.ndim == 3
