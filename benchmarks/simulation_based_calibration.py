@@ -19,13 +19,14 @@ import argparse
 import csv
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from scipy import stats
 
 from bayespbrl.models import Answers, PreferenceModel, gibbs, low_rank, posterior_draws
@@ -44,10 +45,7 @@ def one_run(seed: int, bug: str = "", *, ties: bool = False) -> Ranks:
     """The rank of each true value, in [0, 1]."""
     _plant(bug)
     rng = np.random.default_rng([seed, 19])
-    features = rng.normal(size=(SETTINGS, ITEMS, DIMENSION)) / np.sqrt(2 * DIMENSION)
-    features[1] *= np.linspace(0.2, 1.8, DIMENSION)
-    features[2, :, 1:] *= 0.1  # under this setting one dimension is nearly all that counts
-    features[2, :, 0] *= np.sqrt(DIMENSION)
+    features = _features(rng)
     truth = _truth(rng)
     truth["threshold"] *= ties
     utilities = features[truth["setting"]] @ truth["weights"]
@@ -80,6 +78,25 @@ def one_run(seed: int, bug: str = "", *, ties: bool = False) -> Ranks:
         answer = _answer(rng, float(utilities[first] - utilities[second]), truth)
         pairs = np.concatenate([pairs, [[first, second] if answer >= 0 else [second, first]]])
         tied = np.append(tied, answer == 0)
+    compared = _compared(features, drawn, truth)
+    chosen = rng.choice(len(settings), KEPT, replace=False)
+    return {name: _rank(rng, sample[chosen], true) for name, (sample, true) in compared.items()}
+
+
+def _features(rng: np.random.Generator) -> np.ndarray:
+    """Of the items under each setting, shape (C, n, D)."""
+    features = rng.normal(size=(SETTINGS, ITEMS, DIMENSION)) / np.sqrt(2 * DIMENSION)
+    features[1] *= np.linspace(0.2, 1.8, DIMENSION)
+    features[2, :, 1:] *= 0.1  # under this setting one dimension is nearly all that counts
+    features[2, :, 0] *= np.sqrt(DIMENSION)
+    return features
+
+
+def _compared(features: np.ndarray, drawn: xr.Dataset, truth: dict[str, Any]) -> dict[str, tuple[np.ndarray, float]]:
+    """Draws of each functional, shape (S,), and its true value."""
+    settings, weights = drawn["setting"].values.ravel(), drawn["utility_weights"].values.reshape(-1, DIMENSION)
+    values = {name: drawn[name].values.reshape(len(settings), 1) for name in ("steepness", "lapse_rate")}
+    likelihood = likelihood_of("mixed", float(MOST_ANSWERS), **values)
     held_out = features[:, 0] - features[:, 1]
     margin = np.einsum("sd,sd->s", held_out[settings], weights)
     probability = prob(likelihood, margin[:, None])[:, 0]
@@ -87,21 +104,20 @@ def one_run(seed: int, bug: str = "", *, ties: bool = False) -> Ranks:
     true_likelihood = likelihood_of(
         "mixed", float(MOST_ANSWERS), steepness=truth["steepness"], lapse_rate=truth["lapse"]
     )
-    pairs_of = {
+    compared = {
         "margin": (margin, true_margin),
         "probability": (probability, float(prob(true_likelihood, np.array([true_margin]))[0])),
         "utility of the first": (
             np.einsum("sd,sd->s", features[:, 0][settings], weights),
-            float(utilities[0]),
+            float((features[truth["setting"]] @ truth["weights"])[0]),
         ),
         "lapse rate": (values["lapse_rate"][:, 0], truth["lapse"]),
         "steepness": (values["steepness"][:, 0], truth["steepness"]),
         "setting": ((settings == 2).astype(float), float(truth["setting"] == 2)),
     }
     if "tie_threshold" in drawn:
-        pairs_of["tie threshold"] = (drawn["tie_threshold"].values.ravel(), truth["threshold"])
-    chosen = rng.choice(len(settings), KEPT, replace=False)
-    return {name: _rank(rng, sample[chosen], true) for name, (sample, true) in pairs_of.items()}
+        compared["tie threshold"] = (drawn["tie_threshold"].values.ravel(), truth["threshold"])
+    return compared
 
 
 def _truth(rng: np.random.Generator) -> dict[str, Any]:
@@ -134,7 +150,9 @@ def _rank(rng: np.random.Generator, sample: np.ndarray, true: float) -> float:
     return float((below + rng.integers(equal + 1) + rng.random()) / (len(sample) + 1))
 
 
+@cache
 def _plant(bug: str) -> None:
+    """Once a process: a bug planted again would be wrapped in itself."""
     if bug == "no-setting":
         gibbs._setting_move = lambda key, z, unknowns, problem: (z, unknowns)
     elif bug == "no-volume":
@@ -151,8 +169,7 @@ def _plant(bug: str) -> None:
         def narrower(self: Any, *arguments: Any, prior_scale: float, seed: int) -> None:
             original(self, *arguments, prior_scale=prior_scale / 2, seed=seed)
 
-        if original.__name__ != "narrower":
-            setattr(low_rank.UtilityWeights, "__init__", narrower)  # noqa: B010
+        setattr(low_rank.UtilityWeights, "__init__", narrower)  # noqa: B010
 
 
 def _all_ranks(runs: int, jobs: int, seed: int, bug: str, ties: bool) -> Iterator[Ranks]:
