@@ -25,9 +25,10 @@ def settings(features: StateFeatures, *, inferred: bool, rng: np.random.Generato
         return np.ones((1, dimensions))
     if len(MULTIPLES) ** dimensions <= MOST_SETTINGS:
         return np.array(list(itertools.product(MULTIPLES, repeat=dimensions)))
-    equal = np.repeat(np.array(MULTIPLES)[:, None], dimensions, axis=1)
-    drawn = rng.choice(MULTIPLES, size=(MOST_SETTINGS - len(equal), dimensions))
-    return np.unique(np.concatenate([equal, drawn]), axis=0)
+    chosen = {(multiple,) * dimensions for multiple in MULTIPLES}
+    while len(chosen) < MOST_SETTINGS:  # always as many: another number would compile the sampler anew
+        chosen.add(tuple(rng.choice(MULTIPLES, size=dimensions).tolist()))
+    return np.array(sorted(chosen))
 
 
 def rescaled(features: StateFeatures, multiples: ArrayLike) -> StateFeatures:
