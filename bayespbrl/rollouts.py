@@ -7,7 +7,7 @@ environment if it was opened by its id (its own one where it has one), else epis
 Continuous actions are clipped to the action space, and the clipped action is the one stored.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -61,6 +61,7 @@ def rollout(
     episodes: int,
     max_steps: int | None = None,
     hold: int = 1,
+    starts: Sequence[int] | None = None,
 ) -> tuple[Trajectory, ...]:
     """Trajectories of `episodes` episodes under `policy.sample`.
 
@@ -72,6 +73,7 @@ def rollout(
       max_steps: time limit; by default the environment's own.
       hold: steps for which the policy's random key stays the same, ≥ 1. Each action still follows the policy at its
         state. Noise that neighbouring steps share leads further away than noise that averages out.
+      starts: a seed for the reset of each episode; None: `key` decides on them.
 
     Raises:
       ValueError: bad arguments; no time limit known; an environment that raises or returns NaN, named with the step.
@@ -79,11 +81,15 @@ def rollout(
     env = open_environment(environment)
     steps = _checked(env, policy, key, episodes, max_steps)
     whole("hold", hold)
+    if starts is not None and len(starts) != episodes:
+        raise ValueError(f"starts: expected {episodes}, one for each episode, got {len(starts)}")
     dynamics = _pure_dynamics(env, policy)
     if dynamics is None:
-        return tuple(_by_interface(env, policy, key, episodes, steps, max_steps is not None, hold))
+        return tuple(_by_interface(env, policy, key, steps, max_steps is not None, episodes, hold, starts))
     with jax.enable_x64(True):
-        run = _simulate(dynamics, policy, key, hold, episodes=episodes, steps=steps)
+        keys = jax.random.split(key, episodes)
+        reset_keys = keys if starts is None else jax.vmap(jax.random.key)(np.asarray(starts))
+        run = _simulate(dynamics, policy, keys, reset_keys, hold, steps=steps)
         observations, actions, rewards, terminated, lengths = (np.asarray(part) for part in run)
     if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
         raise ValueError(_not_finite(env, _first_not_finite(observations, rewards)))
@@ -105,7 +111,7 @@ def returns(
     limit = _checked(env, policy, key, episodes, max_steps)
     dynamics = _pure_dynamics(env, policy)
     if dynamics is None:
-        run = _by_interface(env, policy, key, episodes, limit, max_steps is not None)
+        run = _by_interface(env, policy, key, limit, max_steps is not None, episodes)
         rows = [(trajectory.total_reward, len(trajectory), trajectory.terminated) for trajectory in run]
         return Returns(*(np.array(column) for column in zip(*rows, strict=True)))
     with jax.enable_x64(True):
@@ -208,14 +214,21 @@ def _advance(
     return (next_state, next_observation, alive & ~terminated), outcome
 
 
-@partial(jax.jit, static_argnames=("dynamics", "episodes", "steps"), compiler_options=_COMPILER)
+@partial(jax.jit, static_argnames=("dynamics", "steps"), compiler_options=_COMPILER)
 def _simulate(
-    dynamics: FuncEnv, policy: Sampler, key: Key[Array, ""], hold: int, *, episodes: int, steps: int
+    dynamics: FuncEnv,
+    policy: Sampler,
+    keys: Key[Array, " n"],
+    reset_keys: Key[Array, " n"],
+    hold: int,
+    *,
+    steps: int,
 ) -> tuple[Array, ...]:
     """Observations, actions, rewards, whether it terminated and length of each episode."""
 
-    def episode(key: Key[Array, ""]) -> tuple[Array, ...]:
-        running, steps_key = _start(dynamics, key)
+    def episode(key: Key[Array, ""], reset_key: Key[Array, ""]) -> tuple[Array, ...]:
+        running, _ = _start(dynamics, reset_key)
+        _, steps_key = jax.random.split(key)
         first = running[1]
         phase = jax.random.randint(jax.random.fold_in(steps_key, _PHASE), (), 0, hold)
 
@@ -227,7 +240,7 @@ def _simulate(
         _, (observations, actions, rewards, terminated, alive) = jax.lax.scan(scan_step, running, jnp.arange(steps))
         return jnp.concatenate([first[None], observations]), actions, rewards, terminated.any(), alive.sum()
 
-    return jax.vmap(episode)(jax.random.split(key, episodes))
+    return jax.vmap(episode)(keys, reset_keys)
 
 
 @partial(jax.jit, static_argnames=("dynamics", "episodes"), compiler_options=_COMPILER)
@@ -283,10 +296,17 @@ def _act_one_by_one(
 
 
 def _by_interface(
-    env: gymnasium.Env, policy: Sampler, key: Key[Array, ""], episodes: int, steps: int, explicit: bool, hold: int = 1
+    env: gymnasium.Env,
+    policy: Sampler,
+    key: Key[Array, ""],
+    steps: int,
+    explicit: bool,
+    episodes: int,
+    hold: int = 1,
+    starts: Sequence[int] | None = None,
 ) -> Iterator[Trajectory]:
     seed_key, policy_key = jax.random.split(key)
-    seed = int(jax.random.randint(seed_key, (), 0, 2**30))
+    first_seed = int(jax.random.randint(seed_key, (), 0, 2**30))
     choose = _act if _is_pytree(policy) else _act_one_by_one
 
     def act(counter: int, observations: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, "n ..."]:
@@ -297,7 +317,8 @@ def _by_interface(
         return actions
 
     time_limit = steps if explicit else None
+    seeds = first_seed if starts is None else starts
     for states, actions, rewards, terminated in episodes_by_interface(
-        env, act, seed=seed, episodes=episodes, steps=steps, time_limit=time_limit
+        env, act, seeds=seeds, episodes=episodes, steps=steps, time_limit=time_limit
     ):
         yield Trajectory(states, actions, rewards, terminated)

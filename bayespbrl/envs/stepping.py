@@ -1,6 +1,6 @@
 """Episodes through the ordinary gymnasium interface, for environments that offer no pure functions."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -22,7 +22,7 @@ def episodes_by_interface(
     env: gymnasium.Env,
     act: Callable[[int, Rows], Rows],
     *,
-    seed: int,
+    seeds: int | Sequence[int],
     episodes: int,
     steps: int,
     time_limit: int | None = None,
@@ -33,7 +33,7 @@ def episodes_by_interface(
       env: from `open_environment`. If that made it from an id, copies run side by side; else the object itself, one
         episode after the other.
       act: `act(counter, observations) -> actions` for a batch; the counter never repeats.
-      seed: of the first reset; the others count up from it.
+      seeds: of each episode's reset; one number is that of the first, and the others count up from it.
       steps: cap on the length of an episode.
       time_limit: replaces the environment's own limit where copies are made.
 
@@ -41,11 +41,15 @@ def episodes_by_interface(
       ValueError: the environment raised, or returned a number that is not finite; names it and the step.
     """
     lanes = min(episodes, MAX_LANES) if made_from(env) is not None else 1
-    vector = _copies(env, lanes, time_limit)
+    vector = _copies(env, lanes, time_limit, one_by_one=not isinstance(seeds, int))
     name = environment_name(env)
     try:
         for first in range(0, episodes, lanes):
-            vector_episodes = _batch(vector, name, act, seed=seed, first=first, steps=steps)
+            if isinstance(seeds, int):
+                reset: Any = seeds + first
+            else:  # the last lanes may have no episode left
+                reset = [int(seeds[min(first + lane, episodes - 1)]) for lane in range(lanes)]
+            vector_episodes = _batch(vector, name, act, seed=reset, first=first, steps=steps)
             yield from vector_episodes[: episodes - first]
     finally:
         vector.close()
@@ -58,12 +62,17 @@ class _Borrowed(gymnasium.Wrapper):
         """Nothing."""
 
 
-def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None) -> VectorEnv:
+def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None, *, one_by_one: bool) -> VectorEnv:
+    """Copies side by side; `one_by_one` where each has to be reset with a seed of its own."""
     spec = made_from(env)
     if spec is None:
         return SyncVectorEnv([lambda: _Borrowed(env)])
     options: dict[str, Any] = {} if time_limit is None else {"max_episode_steps": time_limit}
-    if spec.vector_entry_point is not None and not options and flattened(env.unwrapped) is env.unwrapped:
+    if (
+        spec.vector_entry_point is not None
+        and not (options or one_by_one)
+        and flattened(env.unwrapped) is env.unwrapped
+    ):
         vector = gymnasium.make_vec(spec, num_envs=lanes)
         # In the other modes the last observation of an episode is hidden, or a reset is due that not all of them allow.
         if vector.metadata.get("autoreset_mode") == AutoresetMode.NEXT_STEP:
@@ -74,7 +83,7 @@ def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None) -> VectorEnv
 
 
 def _batch(
-    vector: VectorEnv, name: str, act: Callable[[int, Rows], Rows], *, seed: int, first: int, steps: int
+    vector: VectorEnv, name: str, act: Callable[[int, Rows], Rows], *, seed: Any, first: int, steps: int
 ) -> list[Episode]:
     """One episode a lane, from episode `first` on.
 
@@ -82,7 +91,7 @@ def _batch(
     """
     lanes, seen, done = vector.num_envs, vector.single_observation_space, vector.single_action_space
     with _blaming(name, "its reset"):
-        observations, _ = vector.reset(seed=seed + first)
+        observations, _ = vector.reset(seed=seed)
     alive, ended, lengths = np.ones(lanes, bool), np.zeros(lanes, bool), np.zeros(lanes, int)
     states, actions, rewards = [_finite(name, "its reset", _wide(seen, observations))], [], []
     t = 0
