@@ -24,7 +24,7 @@ from bayespbrl.studies import Trials, run_trials
 from bayespbrl.studies import trials as trials_module
 from bayespbrl.studies.tables import COLUMNS, collect
 
-QUICK = {"utility": "linear-program", "iterations": 2, "max_steps": 20, "evaluation_episodes": 3}
+QUICK = {"preset": "paper", "utility": "linear-program", "iterations": 2, "max_steps": 20, "evaluation_episodes": 3}
 
 
 class ThisProcess:
@@ -123,6 +123,18 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
     np.testing.assert_array_equal(table["scale"], 2 * [[np.nan, 0.5, 0.5]])
     assert table["spread"].shape == (2, 3, 2)
     np.testing.assert_array_equal(table["spread"].sel(seed=2, iteration=3), [3, 20])
+
+
+def test_a_run_that_ends_earlier_keeps_its_last_figures(tmp_path):
+    for seed, length in ((1, 3), (2, 1)):
+        rows = [{"iteration": i, "value": 10.0 * seed + i, "seconds": {"utility": 1.0}} for i in range(1, length + 1)]
+        summary = {"env": "e", "utility": "u", "seed": seed, "finished": True, "iterations": rows}
+        (tmp_path / str(seed)).mkdir()
+        (tmp_path / str(seed) / "summary.json").write_text(json.dumps(summary))
+    table = collect([tmp_path / "2", tmp_path / "1"])
+    np.testing.assert_array_equal(table["value"].sel(seed=2), [21, 21, 21])
+    np.testing.assert_array_equal(table["value"].sel(seed=1), [11, 12, 13])
+    np.testing.assert_array_equal(table["seconds_utility"].sel(seed=2), [1, np.nan, np.nan])
 
 
 def test_a_trial_is_the_run_of_its_seed(study, tmp_path):
@@ -233,7 +245,7 @@ def test_only_the_acrobot_needs_a_preference_and_within_three_iterations(tmp_pat
     seen = []
     monkeypatch.setattr(trials_module, "_in_parallel", lambda seeds, jobs, progress: seen.append(seeds.study))
     for env in ("acrobot", "bayespbrl/Acrobot-v0", "gridworld", "CartPole-v1"):
-        with pytest.raises(IndexError):  # no run has left a summary
+        with pytest.raises(ValueError, match="empty"):  # no run has left a summary
             run_trials(env, tmp_path, seeds=range(1000, 1001))
     assert [study.preference_within for study in seen] == [3, 3, None, None]
 
@@ -241,7 +253,13 @@ def test_only_the_acrobot_needs_a_preference_and_within_three_iterations(tmp_pat
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_bicycle_trials_tell_survival_and_balancing_time(tmp_path):
-    options = {"utility": "linear-program", "iterations": 2, "centres": 20, "evaluation_episodes": 10}
+    options = {
+        "preset": "paper",
+        "utility": "linear-program",
+        "iterations": 2,
+        "centres": 20,
+        "evaluation_episodes": 10,
+    }
     study = run_trials("bicycle", tmp_path, seeds=range(1, 2), policy="linear-gaussian", **options)
     run = load(tmp_path / "seed-1")
     last = returns("bicycle", run.learner.policy, key=jax.random.key(1), episodes=100, max_steps=3000)
@@ -278,7 +296,18 @@ def test_a_study_that_is_stopped_takes_its_trials_with_it(tmp_path, how):
     # where the tests run in the background interrupts are ignored, and would be here
     heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     command = [sys.executable, "-c", f"{heard}; from bayespbrl.cli.commands import main; main()", "trials", "gridworld"]
-    options = ["--utility", "linear-program", "--iterations", "100000", "--trials", "3", "--jobs", "2"]
+    options = [
+        "--preset",
+        "paper",
+        "--utility",
+        "linear-program",
+        "--iterations",
+        "100000",
+        "--trials",
+        "3",
+        "--jobs",
+        "2",
+    ]
     options += ["--out", str(tmp_path / "study")]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([*command, *options], **streams, start_new_session=True) as study:

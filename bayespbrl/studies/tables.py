@@ -15,7 +15,7 @@ from bayespbrl.learner import Learner
 from bayespbrl.runs.directory import read_summary
 from bayespbrl.runs.files import write_file, written_aside
 
-COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value")
+COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value", "value_newest")
 
 BALANCING_FILE = "balancing.json"
 
@@ -23,13 +23,15 @@ BALANCING_FILE = "balancing.json"
 def collect(directories: Sequence[Path | str]) -> xr.Dataset:
     """The summaries of finished runs as one data set over (seed, iteration).
 
+    A run that ended earlier than others keeps its last figures, but for the seconds, until the last of them ends.
     Numbers are kept, and lists of numbers with a dimension of their own. Those of a nested entry have both names, as
     `seconds_utility`. Missing numbers are NaN.
     """
     summaries = [read_summary(path) for path in directories]
     seeds = [summary["seed"] for summary in summaries]
-    iterations = [entry["iteration"] for entry in summaries[0]["iterations"]]
-    rows = [[_flat(entry) for entry in summary["iterations"]] for summary in summaries]
+    length = max(len(summary["iterations"]) for summary in summaries)
+    iterations = list(range(1, length + 1))
+    rows = [_until(length, [_flat(entry) for entry in summary["iterations"]]) for summary in summaries]
     entries = [entry for summary in summaries for entry in summary["iterations"]]
     nested = {name for entry in entries for name, value in entry.items() if isinstance(value, dict)}
     variables: dict[str, Any] = {}
@@ -59,6 +61,12 @@ def by_answers(answers: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.
     numbers = np.unique(answers[answers >= answers[:, 0].max()])
     last = (answers[:, :, None] <= numbers).sum(axis=1) - 1
     return numbers, np.take_along_axis(values, last, axis=1)
+
+
+def _until(length: int, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows, and the last one again for each that is missing."""
+    kept = {name: value for name, value in rows[-1].items() if not name.startswith("seconds")}
+    return rows + [kept] * (length - len(rows))
 
 
 def _flat(entry: dict[str, Any]) -> dict[str, Any]:
@@ -105,7 +113,7 @@ def write_tables(table: xr.Dataset, directory: Path) -> None:
     Where a balancing time was measured there are three more columns: the share of evaluation episodes that survive, and
     the balancing time of the final policy in steps and in seconds, in the row of the last iteration.
     """
-    rows = table[["answers", "value"]].to_dataframe(["seed", "iteration"]).reset_index()
+    rows = table[["answers", "value", "value_newest"]].to_dataframe(["seed", "iteration"]).reset_index()
     rows = rows.astype({"answers": int}).assign(env=table.attrs["env"], utility=table.attrs["utility"])[[*COLUMNS]]
     if "balancing_steps" in table:
         last = rows["iteration"] == rows["iteration"].max()
