@@ -4,6 +4,7 @@ from bayespbrl.experts import NoisyExpert, ReturnExpert, TerminalExpert
 from bayespbrl.learner import Learner
 from bayespbrl.preferences import Answer, Preferences, Query
 from bayespbrl.runs.run import Run, load, resume, start
+from bayespbrl.runs.utility_reward import UtilityReward
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import infer_utility
@@ -19,6 +20,7 @@ __all__ = [
     "Settings",
     "TerminalExpert",
     "Trajectory",
+    "UtilityReward",
     "infer_utility",
     "load",
     "resume",

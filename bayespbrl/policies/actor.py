@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from jaxtyping import Array, Key
 
 from bayespbrl.policies.batch import sample_actions
-from bayespbrl.policies.policy import Policy
+from bayespbrl.policies.policy import Policy, is_discrete
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class Actor:
       rng: where a call without a key draws from.
       observe: from an observation of the environment to one of the policy's.
       enact: from an action of the policy's to one of the environment.
+      observation_shape: of one observation of the environment.
     """
 
     policy: Policy
@@ -31,6 +32,7 @@ class Actor:
     rng: np.random.Generator
     observe: Callable[[Any], Any] = np.asarray
     enact: Callable[[Any], Any] = np.asarray
+    observation_shape: tuple[int, ...] = ()
 
     def act(self, observation: Any, *, key: Key[Array, ""] | None = None) -> Any:
         """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete."""
@@ -40,8 +42,39 @@ class Actor:
         dtype = np.int64 if np.ndim(observation) == 0 else np.float64
         action = sample_actions(self.policy, key, np.asarray(observation, dtype=dtype)[None])[0]
         if isinstance(self.action_space, Box):
-            action = np.clip(action, self.action_space.low, self.action_space.high).astype(self.action_space.dtype)
-            return self.enact(action)
+            return self._within(action)
         return int(self.enact(action))
 
     __call__ = act
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[Any, Any]:
+        """Action and `state`, for one observation or a batch of them, as stable-baselines3's policies give.
+
+        Args:
+          observation: of the environment, or a batch with a leading axis.
+          state, episode_start: of recurrent policies; passed through and not looked at.
+          deterministic: the mean of continuous actions, or the most probable discrete one, instead of a sample.
+        """
+        observations = np.asarray(observation)
+        if observations.shape == self.observation_shape:
+            return self._chosen(observation, deterministic), state
+        if observations.shape[1:] != self.observation_shape:
+            shape = self.observation_shape
+            raise ValueError(f"observation: expected shape {shape}, or a batch of them, got {observations.shape}")
+        return np.stack([np.asarray(self._chosen(each, deterministic)) for each in observations]), state
+
+    def _chosen(self, observation: Any, deterministic: bool) -> Any:
+        if not deterministic:
+            return self.act(observation)
+        rows = np.asarray(self.observe(observation))[None]
+        if is_discrete(self.policy):
+            return int(self.enact(int(np.argmax(self.policy.probabilities(rows)[0]))))  # type: ignore[attr-defined]
+        mean = self.policy.mean_and_variance(rows.astype(float))[0][0]  # type: ignore[attr-defined]
+        return self._within(mean)
+
+    def _within(self, action: np.ndarray) -> Any:
+        space = self.action_space
+        assert isinstance(space, Box)
+        return self.enact(np.clip(action, space.low, space.high).astype(space.dtype))

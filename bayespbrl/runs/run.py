@@ -128,14 +128,26 @@ class Run:
 
     @property
     def policy(self) -> Actor:
-        """The last policy. `run.policy.act(observation)` is an action; both are of the environment as it was given."""
+        """The policy that the posterior thinks best of those tried; the newest where updates are not checked.
+
+        `run.policy.act(observation)` is an action; both are of the environment as it was given.
+        """
+        return self._actor(self.learner.policy)
+
+    @property
+    def last_policy(self) -> Actor:
+        """The newest policy."""
+        return self._actor(self.learner.last_policy)
+
+    def _actor(self, policy: Policy) -> Actor:
         environment, given = self.learner.environment, self.learner.given
         return Actor(
-            self.learner.policy,
+            policy,
             environment.action_space,
             np.random.default_rng(),
             observe=partial(to_plain, given.observation_space),
             enact=partial(from_plain, given.action_space),
+            observation_shape=given.observation_space.shape or (),
         )
 
     @property
@@ -162,7 +174,7 @@ class Run:
         return None if self.estimate is None else self.estimate.posterior
 
     def evaluate(self, episodes: int = 100, seed: int = 0) -> float:
-        """Mean undiscounted return of the last, stochastic policy over fresh episodes."""
+        """Mean undiscounted return of `policy`, which is stochastic, over fresh episodes."""
         learner = self.learner
         return float(
             rollouts.returns(

@@ -1,0 +1,59 @@
+"""The inferred utility as the reward of an environment, for any library that learns from rewards."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from bayespbrl import checks
+from bayespbrl.envs.opening import to_plain
+from bayespbrl.runs.run import Run
+
+DRAWS = 200  # for the standard deviation: known to a twentieth
+
+
+class UtilityReward(gymnasium.Wrapper):
+    """`env` whose reward is the utility of the state that a step leads to, as the answers are explained.
+
+    `info` of each step has `true_reward`, the environment's own, and `utility_deviation`, the posterior standard
+    deviation of the utility there. A policy that learns from this reward tells whether the utility or the policy of a
+    run is at fault.
+
+    Args:
+      env: an environment with the run's spaces.
+      run: a run with a utility estimate; `bayespbrl.load` reads one.
+      caution: c of the reward mean − c · standard deviation; a negative one rewards what is unknown.
+
+    Raises:
+      ValueError: a run without an estimate of the utility, as before its first answers or with the known reward;
+        another observation or action space than the run's; caution without a posterior.
+    """
+
+    def __init__(self, env: gymnasium.Env, run: Run, *, caution: float = 0.0):
+        super().__init__(env)
+        self.estimate = run.estimate
+        if self.estimate is None or not hasattr(self.estimate, "utilities"):
+            kind = "none yet" if self.estimate is None else type(self.estimate).__name__
+            raise ValueError(f"run: expected one with an estimate of the utility, got {kind}")
+        given = run.learner.given
+        for name in ("observation_space", "action_space"):
+            if getattr(env, name) != getattr(given, name):
+                raise ValueError(f"{name}: expected {getattr(given, name)}, the run's, got {getattr(env, name)}")
+        checks.finite("caution", caution)
+        self.caution = float(caution)
+        if self.caution and self.estimate.posterior is None:
+            raise ValueError("caution: expected 0 for an estimate without a posterior")
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """As of the environment, with the utility as the reward."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        utility, deviation = self._utility(np.asarray(to_plain(self.env.observation_space, observation))[None])
+        info = info | {"true_reward": float(reward), "utility_deviation": deviation}
+        return observation, utility - self.caution * deviation, terminated, truncated, info
+
+    def _utility(self, states: np.ndarray) -> tuple[float, float]:
+        assert self.estimate is not None
+        if self.estimate.posterior is None:
+            return float(self.estimate.utilities(states)[0]), 0.0  # type: ignore[attr-defined]
+        mean, draws = self.estimate.utilities_and_draws(states, number=DRAWS)
+        return float(mean[0]), float(draws[:, 0].std())
