@@ -47,7 +47,11 @@ class LearnerState:
     """What the learner knows between two calls.
 
     Attributes:
-      policy: the current policy.
+      policy: the newest policy, which the next trajectories follow.
+      best_policy: the policy that the run keeps: of all that were tried the one that the posterior thinks best where
+        updates are checked, else the newest.
+      best: the number of the iteration whose trajectories followed the best policy, from 0.
+      trust: share of the KL bound that the next update may use; it falls after a step back.
       estimate: the last utility estimate; None before the first.
       bound: the last decision on the KL bound; None before the first.
       iteration: iterations completed.
@@ -55,9 +59,12 @@ class LearnerState:
       preferences: the answers so far.
       collected: whether the next iteration's trajectories are among them.
       candidates: trajectories to ask about in this iteration, best first.
+      opponents: whom some of them are compared with; the newest undominated trajectory where it names none.
+      information: what the answer about the first of them was expected to tell, nats; None where that is unknown.
       wanted: number of answers still wanted in this iteration.
       unasked: number of consecutive iterations, up to now, without a question.
       query: the question that waits for an answer; None if none does.
+      rivals: the undominated trajectories that the newcomer of the question competes with; None: all.
       queries: number of questions so far.
       shown: the trajectories that were shown in some question.
       summaries: one for each completed iteration.
@@ -65,6 +72,9 @@ class LearnerState:
     """
 
     policy: Any
+    best_policy: Any = None
+    best: int = 0
+    trust: float = 1.0
     estimate: UtilityEstimate | None = None
     bound: Bound | None = None
     iteration: int = 0
@@ -72,13 +82,21 @@ class LearnerState:
     preferences: Preferences = field(default_factory=Preferences)
     collected: bool = False
     candidates: tuple[int, ...] = ()
+    opponents: Mapping[int, int] = field(default_factory=dict)
+    information: float | None = None
     wanted: int = 0
     unasked: int = 0
     query: Query | None = None
+    rivals: tuple[int, ...] | None = None
     queries: int = 0
     shown: frozenset[int] = frozenset()
     summaries: tuple[Mapping[str, Any], ...] = ()
     previous: "LearnerState | None" = field(default=None, repr=False)
+
+    @property
+    def kept_policy(self) -> Any:
+        """The best policy, or the first, before there is one."""
+        return self.policy if self.best_policy is None else self.best_policy
 
 
 def apply(state: LearnerState, entry: Entry) -> LearnerState:
@@ -97,13 +115,24 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
                 raise ValueError(f"asked: expected trajectories below {len(state.trajectories)}, got {shown}")
             both = (state.trajectories[shown[0]], state.trajectories[shown[1]])
             query = Query(event["query"], *shown, event["newcomer"], both)
-            return replace(state, query=query, queries=event["query"], shown=state.shown.union(shown))
+            rivals, number = event.get("rivals"), event["query"]
+            rivals = None if rivals is None else tuple(rivals)
+            return replace(state, query=query, queries=number, shown=state.shown.union(shown), rivals=rivals)
         case "answered":
             return _answered(state, event)
         case "improved":
+            check = event["summary"].get("check")  # of a checked update
+            tried_is_best = check is not None and check["best"] == state.iteration
             return replace(
                 state,
                 policy=entry.parts["policy"],
+                best_policy=entry.parts["policy"]
+                if check is None
+                else state.policy
+                if tried_is_best
+                else state.best_policy,
+                best=state.iteration + 1 if check is None else operator.index(check["best"]),
+                trust=1.0 if check is None else float(check["trust"]),
                 estimate=entry.parts["estimate"],
                 bound=Bound.recalled(event["summary"]["kl_bound"], event["summary"]["schedule"]),
                 iteration=operator.index(event["iteration"]),
@@ -157,7 +186,8 @@ def surviving(log: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:
     candidates, preferences = tuple(event["candidates"]), state.preferences
-    if not preferences.undominated:
+    opponents = event.get("opponents")
+    if not preferences.undominated and opponents is None:
         preferences, candidates = preferences.start(candidates[0]), candidates[1:]
     return replace(
         state,
@@ -165,6 +195,8 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
         preferences=preferences,
         collected=True,
         candidates=candidates,
+        opponents={} if opponents is None else dict(zip(candidates, opponents, strict=True)),
+        information=event.get("information"),
         wanted=event["wanted"],
         unasked=0 if event["wanted"] else state.unasked + 1,
     )
@@ -180,7 +212,9 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     if answer is Answer.SKIP:
         return after
     preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]
-    preferences = state.preferences.add(query.newcomer, query.incumbent, preferred=preferred)
+    preferences = state.preferences.add(
+        query.newcomer, query.incumbent, preferred=preferred, rivals=state.rivals, shown_first=query.first
+    )
     return replace(after, preferences=preferences, wanted=state.wanted - 1)
 
 

@@ -1,35 +1,23 @@
-"""The learner: orders the four steps of the cycle (paper, "Online Preference-Based Reinforcement Learning")."""
+"""The learner: asks, takes answers, and moves through the cycle in between."""
 
-import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import gymnasium
-import jax
 import numpy as np
 
 from bayespbrl import events, queries, rollouts
+from bayespbrl.cycle import Cycle
 from bayespbrl.envs.opening import as_given, environment_attribute, environment_name, given_by_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement.problem import UpdateProblem, states_of_update, step_utilities
-from bayespbrl.improvement.schedules import Bound, Situation
-from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.policies.choice import initial_policy
-from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
-from bayespbrl.queries import QuerySituation
-from bayespbrl.settings import Settings, settings_for
-from bayespbrl.trajectories import Trajectory, Transitions, transitions
-from bayespbrl.utility.comparisons import Comparisons
+from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
+from bayespbrl.settings import Settings, Task, settings_for
+from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
-from bayespbrl.utility.inference import estimate
-
-# Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED = range(8)
-# Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
-SCHEDULE_DRAWS = 100
 
 
 class Learner:
@@ -76,15 +64,19 @@ class Learner:
             environment=None if given_by_name(env) else "other",
             schedule="other" if callable(schedule) else schedule,
             query="other" if callable(query) else query,
+            task=task_of(self.environment, options.get("max_steps")),
             **options,
         )
-        rollouts.step_limit(self.environment, self.settings.rollouts.max_steps)  # an error now, not at the first step
         self.features = features
         period = environment_attribute(self.environment, "observation_period")
         spaces = (self.environment.observation_space, self.environment.action_space)
-        self.feature_source = FeatureSource(*spaces, period, features)
-        self.schedule = _chosen("schedule", schedule, self.settings.update.schedule, schedules.SCHEDULES)
-        self.query_rule = _chosen("query", query, self.settings.questions.query, queries.QUERY_RULES)
+        self.cycle = Cycle(
+            self.settings,
+            self.environment,
+            FeatureSource(*spaces, period, features),
+            _chosen("schedule", schedule, self.settings.update.schedule, schedules.SCHEDULES),
+            _chosen("query", query, self.settings.questions.query, queries.QUERY_RULES),
+        )
         self.log: Log | None = None
         if own_policy is None:
             own_policy = initial_policy(
@@ -104,12 +96,38 @@ class Learner:
 
     @property
     def finished(self) -> bool:
-        """Whether all iterations are completed."""
-        return self.state.iteration >= self.settings.iterations
+        """Whether all iterations are completed, or the budget of answers has done what it can."""
+        state = self.state
+        return not state.collected and self.settings.finished(state.iteration, state.preferences.answers, state.unasked)
 
     @property
     def policy(self) -> Any:
+        """Of the policies that were tried, the one that the posterior thinks best; else the newest."""
+        return self.state.kept_policy
+
+    @property
+    def last_policy(self) -> Any:
+        """The newest policy, which the next trajectories follow."""
         return self.state.policy
+
+    @property
+    def worth_asking(self) -> float | None:
+        """What the answer to the best question of the last iteration was expected to tell, in [0, 1] bits.
+
+        Near zero, more answers would change little. None before the first estimate, and without a posterior.
+        """
+        return None if self.state.information is None else self.state.information / np.log(2)
+
+    @property
+    def comparable_starts(self) -> bool | None:
+        """Whether resets with equal seeds start alike, so that trajectories from one start can be compared.
+
+        None before the first trajectories, and where the run does not compare by start.
+        """
+        number = self.settings.rollouts.trajectories_per_iteration
+        if not self.settings.questions.same_start or not self.state.trajectories:
+            return None
+        return len(same_starts(self.state.trajectories[:number])) < number
 
     @property
     def estimate(self) -> UtilityEstimate | None:
@@ -156,7 +174,7 @@ class Learner:
             if answer is Answer.UNDO:
                 self.undo()
             else:
-                self._record({"event": "answered", "query": query.number, "answer": str(answer)})
+                self._record(Entry({"event": "answered", "query": query.number, "answer": str(answer)}))
 
     def undo(self) -> None:
         """Take the last answer back, and what followed from it; its question waits again.
@@ -164,7 +182,7 @@ class Learner:
         Raises:
           ValueError: nothing has been answered yet.
         """
-        self._record({"event": "undone"})
+        self._record(Entry({"event": "undone"}))
 
     def run(self, expert: Expert, *, progress: Callable[["Learner"], None] | None = None) -> "Learner":
         """Ask `expert` until all iterations are completed.
@@ -185,157 +203,30 @@ class Learner:
     def _waiting(self) -> list[Query]:
         return [] if self.state.query is None else [self.state.query]
 
-    # The four steps.
-
     def _advance(self, progress: Callable[["Learner"], None] | None = None) -> None:
         """Do what can be done without an answer; `progress` is called after each iteration."""
         while self.state.query is None and not self.finished:
             if not self.state.collected:
-                self._collect()
+                self._record(self.cycle.collect(self.state))
             elif self.state.wanted and self.state.candidates:
-                self._show()
+                self._record(self.cycle.show(self.state))
             else:
-                self._improve()
+                self._record(self.cycle.improve(self.state))
                 if progress is not None:
                     progress(self)
 
-    def _collect(self) -> None:
-        """Steps 3 and 4: new trajectories, and which of them to ask about."""
-        state, options, questions = self.state, self.settings.rollouts, self.settings.questions
-        began = time.perf_counter()
-        collected = rollouts.rollout(
-            self.environment,
-            state.policy,
-            key=self._key(COLLECT, state.iteration),
-            episodes=options.trajectories_per_iteration,
-            max_steps=options.max_steps,
-            hold=options.exploration_hold,
-        )
-        new = range(len(state.trajectories), len(state.trajectories) + len(collected))
-        signal = None if state.bound is None else state.bound.signal
-        rng = self._rng(CHOOSE, state.iteration)
-        wanted, candidates = 0, tuple[int, ...]()
-        if state.estimate is None:
-            wanted, candidates = questions.first_queries, queries.random_candidates(new, rng=rng)
-        elif not questions.skips(state.preferences, state.unasked, state.estimate, signal):
-            known, best = (*state.trajectories, *collected), state.preferences.undominated[-1]
-            situation = QuerySituation(new, known, state.shown, best, state.estimate, signal, rng)
-            wanted, candidates = questions.queries_per_iteration, queries.candidates(self.query_rule, situation)
-        event = {
-            "event": "collected",
-            "iteration": state.iteration + 1,
-            "candidates": list(candidates),
-            "wanted": wanted,
-            "seconds": time.perf_counter() - began,
-        }
-        self._record(event, trajectories=collected)
-
-    def _show(self) -> None:
-        """Step 4: the next question, the best candidate against the newest of the undominated."""
-        state = self.state
-        number = state.queries + 1
-        newcomer, incumbent = state.candidates[0], state.preferences.undominated[-1]
-        query = queries.show(number, newcomer, incumbent, state.trajectories, rng=self._rng(SHOW, number))
-        self._record(
-            {"event": "asked", "query": number, "first": query.first, "second": query.second, "newcomer": newcomer}
-        )
-
-    def _improve(self) -> None:
-        """Steps 1 and 2, and the value of the new policy, which the learner does not see."""
-        state, options = self.state, self.settings.rollouts
-        clock = [time.perf_counter()]
-        utility = self._estimate()
-        clock.append(time.perf_counter())
-        improved, bound = self._update(utility, transitions(state.trajectories))
-        clock.append(time.perf_counter())
-        evaluated = rollouts.returns(
-            self.environment,
-            improved.policy,
-            key=self._key(EVALUATE, 0),
-            episodes=options.evaluation_episodes,
-            max_steps=options.max_steps,
-        )
-        clock.append(time.perf_counter())
-        seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
-        summary = {
-            "iteration": state.iteration + 1,
-            "answers": state.preferences.answers,
-            "value": float(evaluated.total.mean()),
-            "terminated": float(evaluated.terminated.mean()),  # a share of the episodes
-            **utility.quality.summary(),
-            **improved.summary(),
-            "seconds": seconds,
-            "schedule": bound.summary(),
-            "hyperparameters": utility.hyperparameters(),
-        }
-        self._record(
-            {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
-            trajectories=state.trajectories[-options.trajectories_per_iteration :],
-            policy=improved.policy,
-            estimate=utility,
-        )
-
-    def _estimate(self) -> UtilityEstimate:
-        """Step 1."""
-        state, settings = self.state, self.settings
-        rng = self._rng(FEATURES, 2 * state.iteration)
-        pairs, ties = state.preferences.pairs, state.preferences.ties
-        return estimate(
-            Comparisons.among(state.trajectories, pairs, ties=ties, discount=settings.trajectory_discount),
-            self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),
-            settings.estimation,
-            settings.model,
-            seed=int(self._rng(FIT, state.iteration).integers(2**31)),
-        )
-
-    def _update(self, utility: UtilityEstimate, steps: Transitions) -> tuple[Improvement, Bound]:
-        """Step 2: an update is proposed, the schedule decides on its bound, the update is applied."""
-        settings, iteration = self.settings, self.state.iteration
-        rng, key = self._rng(FEATURES, 2 * iteration + 1), self._key(IMPROVE, iteration)
-        state_action_features = self.feature_source.of_steps(steps, settings.features.of_critic, rng=rng)
-        constant = isinstance(self.schedule, schedules.ConstantBound)  # looks at no draws
-        utilities, draws = step_utilities(utility, steps, draws=0 if constant else SCHEDULE_DRAWS)
-        problem = UpdateProblem(
-            steps,
-            utilities,
-            states_of_update(
-                self.state.trajectories,
-                settings.update,
-                an_iteration=settings.rollouts.trajectories_per_iteration,
-                rng=self._rng(VISITED, iteration),
-            ),
-            settings.critic,
-            state_action_features,
-            self.feature_source.of_states(self.state.trajectories, settings.features.of_critic, rng=rng),
-            self.environment.action_space,
-        )
-        proposed = propose(self.state.policy, problem, key=key, utility_draws=draws)
-        usual, answers = settings.update.kl_bound, self.state.preferences.answers
-        bound = schedules.decide(self.schedule, Situation(iteration + 1, answers, usual, utility, proposed))
-        improved = apply_update(
-            proposed,
-            bound.kl_bound,
-            key=key,
-            rng=self._rng(IMPROVE, iteration),
-            updates=settings.update.updates_per_iteration,
-        )
-        return improved, bound
-
-    # Memory and chance.
-
-    def _record(self, event: dict[str, Any], **parts: Any) -> None:
+    def _record(self, entry: Entry) -> None:
         """Append to the log first, then move on: what the learner knows is never ahead of what is kept."""
-        entry = Entry(events.plain(event), parts)
         state = events.apply(self.state, entry)
         if self.log is not None:
             self.log.append(entry, state)
         self.state = state
 
-    def _rng(self, purpose: int, count: int) -> np.random.Generator:
-        return np.random.default_rng([self.settings.seed, purpose, count])
 
-    def _key(self, purpose: int, count: int) -> jax.Array:
-        return jax.random.key(int(self._rng(purpose, count).integers(2**31)))
+def task_of(environment: gymnasium.Env, max_steps: int | None = None) -> Task:
+    """What the default preset looks at; `ValueError` where no time limit is known."""
+    horizon = rollouts.step_limit(environment, max_steps)
+    return Task(environment.observation_space, environment.action_space, horizon)
 
 
 def _chosen(option: str, given: Any, name: str, known: Any) -> Any:

@@ -58,45 +58,73 @@ class Preferences:
     Attributes:
       pairs: (preferred, dominated) for each τᵢ ≻ τⱼ.
       ties: pairs that were answered with "no difference". There are K pairs and ties (eq. 8).
-      undominated: the best so far, which tie with each other; the newest last.
+      undominated: those of the shown that no answer puts below another of their start, the newest last. Where all
+        are compared with one another, they are the best so far and tie.
       answers: number of answered questions, ties included.
+      shown_first: those of the pairs and ties that were asked about, each with 1 where its first was shown first and −1
+        where its second was; what follows from an answer for other rivals was shown to nobody.
     """
 
     pairs: tuple[tuple[int, int], ...] = ()
     undominated: tuple[int, ...] = ()
     answers: int = 0
     ties: tuple[tuple[int, int], ...] = ()
+    shown_first: tuple[tuple[tuple[int, int], int], ...] = ()
 
     def start(self, trajectory: int) -> "Preferences":
         """The same preferences with `trajectory` as the first undominated one."""
         return replace(self, undominated=(trajectory,))
 
-    def add(self, newcomer: int, incumbent: int, *, preferred: int | None) -> "Preferences":
-        """The preferences after one comparison of a newcomer with the newest undominated trajectory.
+    def add(
+        self,
+        newcomer: int,
+        incumbent: int,
+        *,
+        preferred: int | None,
+        rivals: Sequence[int] | None = None,
+        shown_first: int | None = None,
+    ) -> "Preferences":
+        """The preferences after one comparison of a newcomer with an incumbent.
 
-        A better newcomer is preferred over every undominated trajectory and replaces them. Over a worse one, every
-        undominated trajectory is preferred. In a tie (`preferred=None`) the newcomer joins them, and the pair is a tie.
+        A better newcomer is preferred over every rival and replaces them. Over a worse one, every rival is preferred.
+        In a tie (`preferred=None`) the newcomer joins them, and the pair is a tie.
+
+        Args:
+          rivals: the undominated trajectories that the newcomer is compared with, the incumbent among them unless it
+            was never shown; None: all.
+          shown_first: which of the two was; None: not known.
 
         Raises:
-          ValueError: an incumbent that is not the newest undominated one, or a preferred that is neither of the two.
+          ValueError: without `rivals`, an incumbent that is not the newest undominated one; a preferred that is neither
+            of the two.
         """
-        if not self.undominated or incumbent != self.undominated[-1]:
+        if rivals is None and (not self.undominated or incumbent != self.undominated[-1]):
             raise ValueError(f"incumbent: expected the newest undominated of {self.undominated}, got {incumbent}")
         if preferred not in (None, newcomer, incumbent):
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
-        answers = self.answers + 1
+        beside = self.undominated if rivals is None else tuple(rivals)
+        if incumbent not in beside:
+            beside = (*beside, incumbent)
+        others = tuple(each for each in self.undominated if each not in beside)
+        asked = (incumbent, newcomer) if preferred == incumbent else (newcomer, incumbent)
+        new_pairs, ties, standing = tuple[tuple[int, int], ...](), self.ties, (*others, *beside)
         if preferred is None:
-            tie = (newcomer, incumbent)
-            return Preferences(self.pairs, (*self.undominated, newcomer), answers, (*self.ties, tie))
-        if preferred == newcomer:
-            new_pairs = tuple((newcomer, member) for member in self.undominated)
-            return Preferences(self.pairs + new_pairs, (newcomer,), answers, self.ties)
-        new_pairs = tuple((member, newcomer) for member in self.undominated)
-        return Preferences(self.pairs + new_pairs, self.undominated, answers, self.ties)
+            ties, standing = (*ties, asked), (*standing, newcomer)
+        elif preferred == newcomer:
+            new_pairs, standing = tuple((newcomer, member) for member in beside), (*others, newcomer)
+        else:
+            new_pairs = tuple((member, newcomer) for member in beside)
+        sides = self.shown_first if shown_first is None else (*self.shown_first, (asked, side_of(asked, shown_first)))
+        return Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, sides)
 
     def differences(self, trajectory_features: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
         """ψ(preferred) − ψ(dominated) for each pair (eq. 5), from ψ of all trajectories."""
         return pair_differences(self.pairs, trajectory_features)
+
+
+def side_of(pair: tuple[int, int], shown_first: int) -> int:
+    """1 where the first of the pair was shown first, else −1."""
+    return 1 if pair[0] == shown_first else -1
 
 
 def pair_differences(
@@ -113,3 +141,40 @@ def pair_differences(
     if np.any(numbers[:, 0] == numbers[:, 1]):
         raise ValueError(f"pairs: expected two different trajectories in each, got {pairs}")
     return trajectory_features[numbers[:, 0]] - trajectory_features[numbers[:, 1]]
+
+
+def same_starts(trajectories: Sequence[Trajectory]) -> list[list[int]]:
+    """The numbers of the trajectories, those from one start together."""
+    groups: dict[bytes, list[int]] = {}
+    for number, trajectory in enumerate(trajectories):
+        groups.setdefault(np.asarray(trajectory.states[0]).tobytes(), []).append(number)
+    return list(groups.values())
+
+
+def opponents_from_the_same_start(
+    trajectories: Sequence[Trajectory], preferences: Preferences, favourites: Sequence[int]
+) -> dict[int, int]:
+    """Whom each trajectory would be compared with: another from the same start, none where there is no other.
+
+    That is the newest undominated one that was shown, else one of `favourites`, else the first.
+    """
+    chosen, standing = {}, preferences.undominated
+    for group in same_starts(trajectories):
+        members = set(group)
+        ranked = [
+            *(number for number in reversed(standing) if number in members),
+            *(number for number in favourites if number in members),
+            *group[:2],
+        ]
+        for number in group:
+            rivals = [other for other in ranked if other != number]
+            if rivals:
+                chosen[number] = rivals[0]
+    return chosen
+
+
+def rivals(query: Query, trajectories: Sequence[Trajectory], preferences: Preferences) -> list[int]:
+    """The undominated trajectories from the start of both, which the newcomer competes with; else all of them."""
+    both = {query.newcomer, query.incumbent}
+    together = [group for group in same_starts(trajectories) if both <= set(group)]
+    return [number for number in preferences.undominated if not together or number in together[0]]

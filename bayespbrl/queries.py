@@ -7,8 +7,9 @@ Three lines make one of your own, for `Learner(query=...)`:
         return sorted(situation.new, reverse=True)
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -22,7 +23,10 @@ from bayespbrl.utility.estimate import UtilityEstimate
 
 # Posterior draws that a rule looks at: enough to order ten candidates, in hundredths of a second.
 QUERY_DRAWS = 500
+MOST_OLDER = 20  # their draws would soon cost more than all else
 UNASKED_SIGNAL = 0.5  # from this signal on an iteration may ask nothing
+# An answer that is expected to tell less is not asked for: it changes what is known about one question in a hundred.
+LEAST_INFORMATION = 0.01 * math.log(2)
 
 
 @dataclass(frozen=True)
@@ -35,27 +39,45 @@ class Questions:
       unasked_iterations: most iterations in a row without a question, at most half the answers so far (ties count),
         once there is a preference. With a schedule that has a signal, only while the posterior has converged and the
         signal is at least `UNASKED_SIGNAL`. The paper's is 0.
+      answers: the budget: most answers of the run, ties included; None for no limit.
+      same_start: whether a newcomer is compared with a trajectory from the same start, where there is one: the better
+        of two unlike starts says little about a policy. The paper compares it with the best of all.
+      worthwhile: whether a question is left out whose answer is expected to tell less than `LEAST_INFORMATION`.
     """
 
     query: str = "highest-utility"
     queries_per_iteration: int = 1
     first_queries: int = 2
     unasked_iterations: int = 0
+    answers: int | None = None
+    same_start: bool = False
+    worthwhile: bool = False
 
     def __post_init__(self) -> None:
         checks.one_of("query", self.query, (*QUERY_RULES, "other"))
         checks.whole("queries_per_iteration", self.queries_per_iteration)
         checks.whole("first_queries", self.first_queries)
         checks.whole("unasked_iterations", self.unasked_iterations, 0)
+        if self.answers is not None:
+            checks.whole("answers", self.answers)
+        for name in ("same_start", "worthwhile"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
 
     def skips(self, preferences: Preferences, unasked: int, estimate: UtilityEstimate, signal: float | None) -> bool:
         """Whether the next iteration asks nothing, after `unasked` in a row that asked nothing.
 
         Decision: at most half the answers so far. Draws from two or three answers agree even where they are wrong.
         """
+        if self.spent(preferences):
+            return True
         if unasked >= min(self.unasked_iterations, preferences.answers // 2) or not preferences.pairs:
             return False
         return signal is None or (estimate.quality.converged and signal >= UNASKED_SIGNAL)
+
+    def spent(self, preferences: Preferences) -> bool:
+        """Whether the budget of answers is used up."""
+        return self.answers is not None and preferences.answers >= self.answers
 
 
 @dataclass(frozen=True)
@@ -66,7 +88,8 @@ class QuerySituation:
       new: numbers of this iteration's trajectories.
       trajectories: all so far, by number, the new ones included.
       shown: numbers of those that some question has shown.
-      incumbent: number of the newest undominated one, which a newcomer is compared with.
+      incumbent: number of the newest undominated one.
+      opponents: whom a trajectory would be compared with, by number; the incumbent where it names none.
       estimate: the utility estimate of the last iteration.
       signal: of the last iteration's bound; None where the schedule has none.
       rng: of everything random.
@@ -79,12 +102,20 @@ class QuerySituation:
     estimate: UtilityEstimate
     signal: float | None
     rng: np.random.Generator
+    opponents: Mapping[int, int] = field(default_factory=dict)
 
-    def draws(self) -> tuple[Float[np.ndarray, "s n"], Float[np.ndarray, " s"]]:
-        """Posterior draws of the utility of each new trajectory and of the incumbent."""
-        compared = [self.trajectories[number] for number in (*self.new, self.incumbent)]
-        draws = self.estimate.trajectory_draws(compared, number=QUERY_DRAWS)
-        return draws[:, :-1], draws[:, -1]
+    def draws(self) -> tuple[Float[np.ndarray, "s n"], Float[np.ndarray, "s n"]]:
+        """Posterior draws of the utility of each new trajectory and of its opponent."""
+        against = [self.opponents.get(number, self.incumbent) for number in self.new]
+        numbers = sorted({*self.new, *against})
+        draws = self.estimate.trajectory_draws([self.trajectories[n] for n in numbers], number=QUERY_DRAWS)
+        column = {number: position for position, number in enumerate(numbers)}
+        return draws[:, [column[n] for n in self.new]], draws[:, [column[n] for n in against]]
+
+    def information(self) -> Float[np.ndarray, " n"]:
+        """The `expected_information` of a question about each new trajectory."""
+        utilities, opponents = self.draws()
+        return expected_information(utilities, opponents, likelihood=self.estimate.likelihood(QUERY_DRAWS))
 
 
 QueryRule = Callable[[QuerySituation], Sequence[int]]
@@ -98,9 +129,9 @@ def highest_utility(situation: QuerySituation) -> list[int]:
 
 
 def probably_better(situation: QuerySituation) -> list[int]:
-    """The trajectory that is most probably better than the incumbent first."""
-    utilities, incumbent = situation.draws()
-    return _ordered(situation, utilities, probability_better(utilities, incumbent))
+    """The trajectory that is most probably better than its opponent first."""
+    utilities, opponents = situation.draws()
+    return _ordered(situation, utilities, probability_better(utilities, opponents))
 
 
 def thompson(situation: QuerySituation) -> list[int]:
@@ -110,22 +141,25 @@ def thompson(situation: QuerySituation) -> list[int]:
 
 
 def information(situation: QuerySituation) -> list[int]:
-    """The comparison with the incumbent whose answer has the highest `expected_information` first."""
-    utilities, incumbent = situation.draws()
-    scores = expected_information(utilities, incumbent, likelihood=situation.estimate.likelihood(QUERY_DRAWS))
+    """The comparison whose answer has the highest `expected_information` first."""
+    utilities, opponents = situation.draws()
+    scores = expected_information(utilities, opponents, likelihood=situation.estimate.likelihood(QUERY_DRAWS))
     return _ordered(situation, utilities, scores)
 
 
 def disagreement(situation: QuerySituation) -> list[int]:
-    """The comparison with the incumbent that the draws disagree on most first: the variance of which is better."""
-    utilities, incumbent = situation.draws()
-    better = probability_better(utilities, incumbent)
+    """The comparison that the draws disagree on most first: the variance of which is better."""
+    utilities, opponents = situation.draws()
+    better = probability_better(utilities, opponents)
     return _ordered(situation, utilities, better * (1 - better))
 
 
 @dataclass(frozen=True)
 class InformationWhenUnsure:
-    """`highest_utility` while the signal is at least `sure`; else `information` about any trajectory never shown."""
+    """`highest_utility` while the signal is at least `sure`; else `information` about any trajectory never shown.
+
+    Of older iterations' it looks at `MOST_OLDER`, drawn at random.
+    """
 
     sure: float = 0.75
 
@@ -133,7 +167,9 @@ class InformationWhenUnsure:
         if (situation.signal or 0.0) >= self.sure:
             return highest_utility(situation)
         never = [number for number in range(len(situation.trajectories)) if number not in situation.shown]
-        return information(replace(situation, new=never))
+        older = [number for number in never if number not in situation.new]
+        some = situation.rng.permutation(older)[:MOST_OLDER].tolist()
+        return information(replace(situation, new=[n for n in never if n in situation.new or n in some]))
 
 
 QUERY_RULES: dict[str, QueryRule] = {
@@ -168,6 +204,44 @@ def random_candidates(numbers: Sequence[int], *, rng: np.random.Generator) -> tu
     return tuple(int(number) for number in rng.permutation(np.asarray(numbers)))
 
 
+@dataclass(frozen=True)
+class Chosen:
+    """Which questions an iteration asks.
+
+    Attributes:
+      wanted: how many answers.
+      candidates: trajectories to ask about, best first.
+      opponents: whom each is compared with; None: the newest undominated one.
+      information: what the answer to the first question is expected to tell, nats; None where that was not asked.
+    """
+
+    wanted: int = 0
+    candidates: tuple[int, ...] = ()
+    opponents: tuple[int, ...] | None = None
+    information: float | None = None
+
+
+def first_questions(
+    new: Sequence[int], opponents: Mapping[int, int], options: Questions, *, rng: np.random.Generator
+) -> Chosen:
+    """Random ones, before there is an estimate to choose by (paper, step 4); with opponents, each pair once."""
+    wanted = options.first_queries if options.answers is None else min(options.first_queries, options.answers)
+    pairs = [number for number in new if opponents.get(number, number) < number]
+    candidates = random_candidates(pairs or new, rng=rng)
+    return Chosen(wanted, candidates, tuple(opponents[n] for n in candidates) if pairs else None)
+
+
+def later_questions(rule: QueryRule, situation: QuerySituation, options: Questions) -> Chosen:
+    """Those of `rule`; none where the best is not worth asking."""
+    order, opponents, information = candidates(rule, situation), None, None
+    if options.same_start:
+        opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)
+    if options.worthwhile and situation.estimate.posterior is not None:
+        information = float(replace(situation, new=order[:1]).information()[0])
+    worth = information is None or information >= LEAST_INFORMATION
+    return Chosen(options.queries_per_iteration if worth else 0, order, opponents, information)
+
+
 def _ordered(
     situation: QuerySituation, utilities: Float[np.ndarray, "s n"], scores: Float[np.ndarray, " n"]
 ) -> list[int]:
@@ -176,31 +250,34 @@ def _ordered(
 
 
 def probability_better(
-    utilities: Float[np.ndarray, "s n"], incumbent: Float[np.ndarray, " s"]
+    utilities: Float[np.ndarray, "s n"], opponents: Float[np.ndarray, "s n"] | Float[np.ndarray, " s"]
 ) -> Float[np.ndarray, " n"]:
-    """Posterior probability that each of n trajectories is better than the incumbent; equal utilities count half.
+    """Posterior probability that each of n trajectories is better than its opponent; equal utilities count half.
 
     Args:
-      utilities, incumbent: posterior draws, shapes (S, n) and (S,).
+      utilities, opponents: posterior draws, shapes (S, n), and (S, n) or (S,) for one opponent of all.
 
     Returns:
       shape (n,).
     """
-    utilities, incumbent = _fitting_draws(utilities, incumbent)
-    return np.mean((1 + np.sign(utilities - incumbent[:, None])) / 2, axis=0)
+    utilities, opponents = _fitting_draws(utilities, opponents)
+    return np.mean((1 + np.sign(utilities - opponents)) / 2, axis=0)
 
 
 def expected_information(
-    utilities: Float[np.ndarray, "s n"], incumbent: Float[np.ndarray, " s"], *, likelihood: Likelihood
+    utilities: Float[np.ndarray, "s n"],
+    opponents: Float[np.ndarray, "s n"] | Float[np.ndarray, " s"],
+    *,
+    likelihood: Likelihood,
 ) -> Float[np.ndarray, " n"]:
-    """What the answer to "this one or the incumbent?" is expected to tell about the utility, in nats, ≤ log 2.
+    """What the answer to "this one or its opponent?" is expected to tell about the utility, in nats, ≤ log 2.
 
     The mutual information of answer and weights, H(E p) − E H(p), with p the likelihood of the one answer at each draw
     and H the entropy of a coin: it is large where the draws are each sure and do not agree. What no weights could
     predict, as the coin tosses of a lapse rate, does not count.
 
     Args:
-      utilities, incumbent: posterior draws, shapes (S, n) and (S,).
+      utilities, opponents: posterior draws, shapes (S, n), and (S, n) or (S,) for one opponent of all.
       likelihood: of an answer given its margin, the difference of the two utilities; its parameters are numbers, or
         have shape (S, 1), one for each draw.
 
@@ -210,8 +287,8 @@ def expected_information(
     Source: Houlsby, Huszár, Ghahramani and Lengyel (2011), "Bayesian active learning for classification and preference
     learning", eq. 2.
     """
-    utilities, incumbent = _fitting_draws(utilities, incumbent)
-    p = prob(likelihood, utilities - incumbent[:, None])
+    utilities, opponents = _fitting_draws(utilities, opponents)
+    p = prob(likelihood, utilities - opponents)
     # the estimate from the same draws is never negative but for rounding
     return np.maximum(_entropy(p.mean(axis=0)) - _entropy(p).mean(axis=0), 0.0)
 
@@ -221,16 +298,17 @@ def _entropy(p: np.ndarray) -> np.ndarray:
     return entr(p) + entr(np.maximum(1 - p, 0.0))
 
 
-def _fitting_draws(utilities: np.ndarray, incumbent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    utilities, incumbent = np.asarray(utilities, dtype=np.float64), np.asarray(incumbent, dtype=np.float64)
-    if utilities.ndim != 2 or len(utilities) == 0 or incumbent.shape != utilities.shape[:1]:
+def _fitting_draws(utilities: np.ndarray, opponents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    utilities, opponents = np.asarray(utilities, dtype=np.float64), np.asarray(opponents, dtype=np.float64)
+    fits = opponents.shape in (utilities.shape, utilities.shape[:1])
+    if utilities.ndim != 2 or len(utilities) == 0 or not fits:
         raise ValueError(
-            "utilities: expected draws of shapes (S, n) and (S,) of the new and of the incumbent, "
-            f"got {utilities.shape} and {incumbent.shape}"
+            "utilities: expected draws of shape (S, n), and of shape (S, n) or (S,) of the opponents, "
+            f"got {utilities.shape} and {opponents.shape}"
         )
-    if not (np.isfinite(utilities).all() and np.isfinite(incumbent).all()):
+    if not (np.isfinite(utilities).all() and np.isfinite(opponents).all()):
         raise ValueError("utilities: expected finite draws, got NaN or infinity")
-    return utilities, incumbent
+    return utilities, opponents.reshape(len(opponents), -1)
 
 
 def show(

@@ -10,29 +10,32 @@ processor seconds with and without the schedule, and the difference as a share o
 import argparse
 import json
 import time
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from bayespbrl import Learner, ReturnExpert
+from bayespbrl.cycle import Cycle
+from bayespbrl.events import LearnerState
 from bayespbrl.improvement import schedules
+from bayespbrl.improvement.check import Check
 from bayespbrl.improvement.update import Improvement
-from bayespbrl.trajectories import Transitions
 from bayespbrl.utility import UtilityEstimate
 
 
-class Twice(Learner):
-    """A learner that repeats each update without looking at posterior draws."""
+@dataclass(frozen=True)
+class Twice(Cycle):
+    """A cycle that repeats each update without looking at posterior draws."""
 
-    def __init__(self, *arguments: Any, **settings: Any):
-        super().__init__(*arguments, **settings)
-        self.seconds = {"with": 0.0, "without": 0.0}
+    seconds: dict[str, float] = field(default_factory=lambda: {"with": 0.0, "without": 0.0})
 
-    def _update(self, utility: UtilityEstimate, steps: Transitions) -> tuple[Improvement, schedules.Bound]:
-        schedule, began = self.schedule, time.process_time()
-        improved, bound = super()._update(utility, steps)
+    def update(
+        self, state: LearnerState, utility: UtilityEstimate, check: Check | None
+    ) -> tuple[Improvement, schedules.Bound]:
+        """The update, and the same again with a constant bound."""
+        began = time.process_time()
+        improved, bound = super().update(state, utility, check)
         between = time.process_time()
-        self.schedule = schedules.ConstantBound(bound.kl_bound)
-        super()._update(utility, steps)
-        self.schedule = schedule
+        Cycle.update(replace(self, schedule=schedules.ConstantBound(bound.kl_bound)), state, utility, check)
         self.seconds["with"] += between - began
         self.seconds["without"] += time.process_time() - between
         return improved, bound
@@ -41,11 +44,12 @@ class Twice(Learner):
 def measure(environment: str, **settings: Any) -> dict[str, Any]:
     """The figures of the second of two trials, as in the JSON line."""
     for _ in range(2):
-        learner = Twice(environment, schedule="confidence", **settings)
+        learner = Learner(environment, schedule="confidence", **settings)
+        learner.cycle = cycle = Twice(**vars(learner.cycle))
         began = time.process_time()
         learner.run(ReturnExpert())
         seconds = time.process_time() - began
-    updates = learner.seconds
+    updates = cycle.seconds
     whole = seconds - updates["with"]  # one update an iteration: those without
     return {
         "benchmark": "schedule",

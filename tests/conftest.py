@@ -43,7 +43,7 @@ os.environ["PYTHONWARNINGS"] = "ignore:Error reading persistent compilation cach
 
 import bayespbrl
 
-QUICK = {"max_steps": 20, "evaluation_episodes": 3}
+QUICK = {"preset": "paper", "max_steps": 20, "evaluation_episodes": 3}
 
 
 @pytest.fixture(scope="session")

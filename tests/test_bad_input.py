@@ -11,7 +11,14 @@ from bayespbrl.policies import LinearGaussianPolicy
 from bayespbrl.runs import run as runs
 
 STEPS = 5
-QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": STEPS, "evaluation_episodes": 4, "centres": 20}
+QUICK = {
+    "preset": "paper",
+    "utility": "linear-program",
+    "iterations": 3,
+    "max_steps": STEPS,
+    "evaluation_episodes": 4,
+    "centres": 20,
+}
 # 10 trajectories of an iteration, then 4 of its evaluation, and so on
 AN_ITERATION = (10 + 4) * STEPS
 

@@ -19,7 +19,7 @@ from bayespbrl.cli.display import show_trials
 from bayespbrl.experts import simulated_expert
 from bayespbrl.studies import Trials
 
-SHORT = ["--utility", "linear-program", "--max-steps", "20"]
+SHORT = ["--preset", "paper", "--utility", "linear-program", "--max-steps", "20"]
 QUICK = [*SHORT, "--iterations", "2"]
 
 
@@ -130,7 +130,7 @@ def test_resuming_a_finished_run_says_so(monkeypatch, capsys, finished):
 @pytest.mark.slow
 def test_resuming_draws_the_pictures_that_a_finished_run_lacks(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
-    options = {"utility": "linear-program", "iterations": 1, "max_steps": 20, "expert": "other"}
+    options = {"preset": "paper", "utility": "linear-program", "iterations": 1, "max_steps": 20, "expert": "other"}
     bayespbrl.start("gridworld", out, **options).run(simulated_expert())
     before = (out / "events.jsonl").read_bytes()
     assert call(monkeypatch, "resume", out) == 0
@@ -146,7 +146,7 @@ def test_nobody_answers_for_an_expert_of_the_users_own(monkeypatch, capsys, tmp_
         monkeypatch, capsys, "run", "gridworld", *QUICK, "--expert", "other", "--out", tmp_path / "run"
     )
     assert not (tmp_path / "run").exists()
-    options = {"utility": "linear-program", "iterations": 2, "max_steps": 20}
+    options = {"preset": "paper", "utility": "linear-program", "iterations": 2, "max_steps": 20}
     bayespbrl.start("gridworld", tmp_path / "own", **options, expert="other").ask()
     before = (tmp_path / "own" / "events.jsonl").read_bytes()
     assert "got other" in refused(monkeypatch, capsys, "resume", tmp_path / "own")

@@ -10,7 +10,14 @@ from bayespbrl import Learner
 from bayespbrl.envs import pictures
 from bayespbrl.runs.film import FRAMES, film_policy
 
-QUICK = {"utility": "linear-program", "iterations": 1, "evaluation_episodes": 2, "seed": 3, "centres": 10}
+QUICK = {
+    "preset": "paper",
+    "utility": "linear-program",
+    "iterations": 1,
+    "evaluation_episodes": 2,
+    "seed": 3,
+    "centres": 10,
+}
 
 
 class Counter(gymnasium.Env):

@@ -97,12 +97,56 @@ def test_q_of_utilities_side_by_side_is_that_of_each_alone():
     others = np.random.default_rng(0).normal(size=(len(steps), 2))  # not a function of the state
     features = StateActionProduct(OneHot(STATES), ACTIONS)
     options = {"key": jax.random.key(1), "action_space": Discrete(ACTIONS), "features": features, "critic": CRITIC}
-    together = q_function.estimate_q(random_policy(), steps, np.column_stack([utilities, others]), **options)
+    together = q_function.estimate_q(
+        random_policy(), q_function.Evidence(steps, np.column_stack([utilities, others])), **options
+    )
     states, actions = np.divmod(np.arange(STATES * ACTIONS), ACTIONS)
     for column, alone in enumerate([utilities, *others.T]):
-        by_itself = q_function.estimate_q(random_policy(), steps, alone, **options)
+        by_itself = q_function.estimate_q(random_policy(), q_function.Evidence(steps, alone), **options)
         np.testing.assert_allclose(together(states, actions)[:, column], by_itself(states, actions), atol=1e-9)
     assert together(states, actions).shape == (STATES * ACTIONS, 3)
+
+
+def test_four_quarters_have_three_divisions_into_halves_which_add_up_to_the_whole():
+    assert q_function.halvings(list("abcd")) == [
+        (["a", "b"], ["c", "d"]),
+        (["a", "c"], ["b", "d"]),
+        (["a", "d"], ["b", "c"]),
+    ]
+    assert q_function.halvings(["a", "b"]) == [(["a"], ["b"])]
+    assert q_function.halvings(["a"]) == []
+
+
+def test_the_halves_are_q_from_half_of_the_transitions_and_the_whole_stays_as_it_was():
+    steps, utilities = random_steps(terminated=True)
+    quarters = np.arange(len(steps)) // 7 % 4
+    features = StateActionProduct(OneHot(STATES), ACTIONS)
+    options = {"key": jax.random.key(1), "action_space": Discrete(ACTIONS), "features": features, "critic": CRITIC}
+
+    def estimated(*data):
+        return q_function.estimate_q(random_policy(), q_function.Evidence(*data), **options)
+
+    q = estimated(steps, utilities, quarters)
+    np.testing.assert_allclose(q.weights, estimated(steps, utilities).weights, atol=1e-5)
+    states, actions = np.divmod(np.arange(STATES * ACTIONS), ACTIONS)
+    whole, halves = q.with_halves(states, actions)
+    np.testing.assert_array_equal(whole, q(states, actions))
+    assert halves.shape == (STATES * ACTIONS, 2, 3)
+    for number, firsts in enumerate(((0, 1), (0, 2), (0, 3))):
+        for side, chosen in enumerate((np.isin(quarters, firsts), ~np.isin(quarters, firsts))):
+            rows = Transitions(*(column[chosen] for column in vars(steps).values()))
+            alone = estimated(rows, utilities[chosen])(states, actions)
+            np.testing.assert_allclose(halves[:, side, number], alone, atol=1e-6)
+
+
+@pytest.mark.parametrize(("noise", "expected"), [(0.0, (0.7, 1.0)), (100.0, (0.0, 0.5))])
+def test_reliability_is_near_one_where_transitions_tell_q_and_low_where_they_do_not(noise, expected):
+    steps, utilities = random_steps(terminated=True)
+    noisy = utilities + noise * np.random.default_rng(2).normal(size=len(steps))
+    quarters = np.arange(len(steps)) // 50 % 4
+    proposed = update.propose(random_policy(), problem(steps, noisy, quarters=quarters), key=jax.random.key(1))
+    assert expected[0] <= proposed.reliability <= expected[1]
+    assert update.propose(random_policy(), problem(steps, noisy), key=jax.random.key(1)).reliability == 1.0
 
 
 @pytest.mark.parametrize("continuous", [False, True])
@@ -120,9 +164,13 @@ def test_q_is_the_same_however_many_transitions_are_taken_at_a_time(monkeypatch,
         (steps, utilities), space, policy = random_steps(terminated=True), Discrete(ACTIONS), random_policy()
         features = StateActionProduct(OneHot(STATES), ACTIONS)
     options = {"key": jax.random.key(1), "action_space": space, "features": features, "critic": CRITIC}
-    at_once = q_function.estimate_q(policy, steps, utilities, **options)(steps.states, steps.actions)
+    at_once = q_function.estimate_q(policy, q_function.Evidence(steps, utilities), **options)(
+        steps.states, steps.actions
+    )
     monkeypatch.setattr(q_function, "ROWS_AT_A_TIME", 7)
-    in_blocks = q_function.estimate_q(policy, steps, utilities, **options)(steps.states, steps.actions)
+    in_blocks = q_function.estimate_q(policy, q_function.Evidence(steps, utilities), **options)(
+        steps.states, steps.actions
+    )
     np.testing.assert_allclose(in_blocks, at_once, atol=1e-6)
 
 

@@ -12,7 +12,7 @@ from gymnasium.spaces import Discrete
 from toys import Slope, fingerprint
 
 from bayespbrl import Answer, Learner, ReturnExpert, load, queries, resume, rollouts, start
-from bayespbrl import learner as learner_module
+from bayespbrl import cycle as cycle_module
 from bayespbrl.diagnostics.estimates import first_preferred_probability
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.improvement.schedules import Bound
@@ -21,7 +21,14 @@ from bayespbrl.models import restored, stored
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
 
-QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
+QUICK = {
+    "preset": "paper",
+    "utility": "linear-program",
+    "iterations": 3,
+    "max_steps": 20,
+    "evaluation_episodes": 3,
+    "seed": 7,
+}
 
 
 class Memory:
@@ -215,14 +222,16 @@ def test_bound_question_and_prediction_are_all_of_the_runs_one_posterior():
         tree["posterior"][name] = -tree["posterior"][name]
     turned = replace(kept, posterior=restored(tree))  # every draw says the opposite, all else is as it was
 
-    steps, new = transitions(run.trajectories[:-10]), range(len(run.trajectories) - 10, len(run.trajectories))
+    new = range(len(run.trajectories) - 10, len(run.trajectories))
     bounds, orders, predicted = [], [], []
     for estimate in (kept, turned):
-        bounds.append(run._update(estimate, steps)[1])
+        bounds.append(run.cycle.update(run.state, estimate, None)[1])
         incumbent = run.preferences.undominated[-1]
         shown = run.state.shown - {question.newcomer}
-        situation = queries.QuerySituation(new, run.trajectories, shown, incumbent, estimate, None, run._rng(1, 2))
-        orders.append(queries.candidates(run.query_rule, situation))
+        situation = queries.QuerySituation(
+            new, run.trajectories, shown, incumbent, estimate, None, run.cycle._rng(1, 2)
+        )
+        orders.append(queries.candidates(run.cycle.query_rule, situation))
         predicted.append(first_preferred_probability(estimate, *question.trajectories))
     assert bounds[0].statistics["agreement"] > 0.5 > bounds[1].statistics["agreement"]
     collected = [entry.event for entry in log.entries if entry.event["event"] == "collected"]
@@ -236,7 +245,13 @@ def test_bound_question_and_prediction_are_all_of_the_runs_one_posterior():
 @pytest.mark.parametrize("threshold", [0.0, 0.5, 1.1])
 def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
     monkeypatch.setattr(queries, "UNASKED_SIGNAL", threshold)
-    options = {"utility": "posterior-mean", "schedule": "confidence", "unasked_iterations": 2, "iterations": 12}
+    options = {
+        "preset": "paper",
+        "utility": "posterior-mean",
+        "schedule": "confidence",
+        "unasked_iterations": 2,
+        "iterations": 12,
+    }
     run = learner(**options).run(ReturnExpert())
     unasked = 0
     for last, summary in itertools.pairwise(run.iterations):
@@ -492,7 +507,14 @@ def test_bad_options_are_refused(env, options, message):
         Learner(env, **options)
 
 
-SLOPE = {"utility": "linear-program", "iterations": 2, "max_steps": 5, "evaluation_episodes": 4, "centres": 20}
+SLOPE = {
+    "preset": "paper",
+    "utility": "linear-program",
+    "iterations": 2,
+    "max_steps": 5,
+    "evaluation_episodes": 4,
+    "centres": 20,
+}
 
 
 def test_continuous_actions_and_an_ordinary_environment_are_learned_alike():
@@ -549,13 +571,13 @@ def compilations_after(run, iteration):
 
 def seen_problems(monkeypatch):
     """The problem of each update from now on."""
-    seen, real = [], learner_module.propose
+    seen, real = [], cycle_module.propose
 
     def propose(policy, problem, **options):
         seen.append(problem)
         return real(policy, problem, **options)
 
-    monkeypatch.setattr(learner_module, "propose", propose)
+    monkeypatch.setattr(cycle_module, "propose", propose)
     return seen
 
 
@@ -572,7 +594,14 @@ def test_answers_have_a_discount_of_their_own(monkeypatch):
 @pytest.mark.slow
 def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch):
     problems = seen_problems(monkeypatch)
-    options = {"iterations": 3, "max_steps": 12, "centres": 20, "evaluation_episodes": 2, "utility": "linear-program"}
+    options = {
+        "preset": "paper",
+        "iterations": 3,
+        "max_steps": 12,
+        "centres": 20,
+        "evaluation_episodes": 2,
+        "utility": "linear-program",
+    }
     run = Learner("swing-up", seed=3, update_states=150, recent_iterations=2, **options).run(ReturnExpert())
     acted = [{tuple(state) for state in trajectory.states[:-1]} for trajectory in run.trajectories]
     seen = [problem.states for problem in problems]
@@ -595,7 +624,14 @@ def test_the_bound_of_an_iteration_is_decided_once_and_followed_by_several_updat
         asked.append((situation.iteration, situation.update.q_draws.shape[1]))
         return 0.2
 
-    options = {"iterations": 3, "max_steps": 12, "centres": 20, "evaluation_episodes": 2, "hyperparameters": "given"}
+    options = {
+        "preset": "paper",
+        "iterations": 3,
+        "max_steps": 12,
+        "centres": 20,
+        "evaluation_episodes": 2,
+        "hyperparameters": "given",
+    }
     once, often, again = (
         Learner("swing-up", seed=3, schedule=cautious, updates_per_iteration=number, **options).run(ReturnExpert())
         for number in (1, 3, 3)
@@ -639,7 +675,7 @@ def test_a_continued_run_draws_the_same_posterior():
 
 @pytest.mark.slow
 def test_the_gridworld_is_learned_from_preferences():
-    run = Learner("gridworld", iterations=12, seed=1000, evaluation_episodes=50).run(ReturnExpert())
+    run = Learner("gridworld", preset="paper", iterations=12, seed=1000, evaluation_episodes=50).run(ReturnExpert())
     assert run.iterations[-1]["value"] > 3 * 44.34  # of the uniform policy
     assert all(summary["rhat_max"] < 1.01 for summary in run.iterations if summary["utility_converged"])
 

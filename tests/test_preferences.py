@@ -22,6 +22,25 @@ def test_a_tie_joins_the_undominated_and_is_kept_as_a_tie_not_as_a_pair():
     assert before.add(7, 0, preferred=None) == Preferences(((0, 5),), (0, 7), 2, ((7, 0),))
 
 
+def test_only_rivals_of_the_same_start_are_compared_and_the_others_stand():
+    before = Preferences(undominated=(0, 2, 3), answers=4)
+    better = before.add(7, 2, preferred=7, rivals=[2])
+    assert better == Preferences(((7, 2),), (0, 3, 7), 5)
+    worse = before.add(7, 2, preferred=2, rivals=[2])
+    assert worse == Preferences(((2, 7),), (0, 3, 2), 5)
+    never_shown = before.add(7, 5, preferred=None, rivals=[])
+    assert never_shown == Preferences((), (0, 2, 3, 5, 7), 5, ((7, 5),))
+
+
+def test_the_side_is_known_of_what_was_asked_and_of_nothing_that_follows():
+    before = Preferences(undominated=(0, 2), answers=2)
+    assert before.add(7, 2, preferred=7, shown_first=7).shown_first == (((7, 2), 1),)
+    assert before.add(7, 2, preferred=7, shown_first=2).shown_first == (((7, 2), -1),)
+    assert before.add(7, 2, preferred=2, shown_first=7).shown_first == (((2, 7), -1),)
+    both = before.add(7, 2, preferred=None, shown_first=2).add(8, 7, preferred=8, shown_first=8)
+    assert both.shown_first == (((7, 2), -1), ((8, 7), 1))
+
+
 def test_five_answers_by_hand():
     # 0 is the first; 1 better; 2 ties with 1; 3 worse than both; 4 ties with 2; 5 better than 1, 2 and 4.
     preferences = Preferences().start(0)

@@ -1,19 +1,28 @@
 """Step 4: candidates and how they are shown."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bayespbrl.models.likelihoods import Logistic, Mixed, Probit, WithLapses
+from bayespbrl.preferences import Preferences, opponents_from_the_same_start, rivals, same_starts
 from bayespbrl.queries import (
+    LEAST_INFORMATION,
     QUERY_RULES,
     InformationWhenUnsure,
     QuerySituation,
+    Questions,
     candidates,
     expected_information,
+    first_questions,
+    later_questions,
     probability_better,
     random_candidates,
     show,
 )
+from bayespbrl.trajectories import Trajectory
 
 
 class Draws:
@@ -196,7 +205,7 @@ def test_information_prefers_what_the_posterior_is_unsure_of_over_what_the_exper
 @pytest.mark.parametrize(
     ("utilities", "incumbent", "message"),
     [
-        (DRAWS, np.zeros(3), r"utilities: expected draws of shapes \(S, n\) and \(S,\).*got \(4, 3\) and \(3,\)"),
+        (DRAWS, np.zeros(3), r"utilities: expected draws of shape \(S, n\), and .*got \(4, 3\) and \(3,\)"),
         (DRAWS[0], ZERO, "utilities: expected draws"),
         (DRAWS[:0], ZERO[:0], "utilities: expected draws"),
         (DRAWS * np.nan, ZERO, "utilities: expected finite draws"),
@@ -214,6 +223,74 @@ def test_without_a_sure_signal_information_is_asked_about_all_that_was_never_sho
     for signal, expected in ((None, (0,)), (0.74, (0,)), (0.75, (1,)), (1.0, (1,))):
         given = situation(DRAWS * [9.0, 0.2, 0.2], ZERO, signal=signal, **about)
         assert candidates(InformationWhenUnsure(), given) == expected
+
+
+def test_each_is_compared_with_its_own_opponent():
+    opponents = DRAWS[:, [1, 2, 0]]
+    np.testing.assert_array_equal(probability_better(DRAWS, opponents), [0.375, 0.5, 0.25])
+    given = replace(situation(DRAWS, ZERO, likelihood=Logistic(1.0)), opponents={0: 1, 1: 2, 2: 0})
+    alone = [
+        expected_information(DRAWS[:, [i]], DRAWS[:, j], likelihood=Logistic(1.0))[0]
+        for i, j in ((0, 1), (1, 2), (2, 0))
+    ]
+    np.testing.assert_allclose(given.information(), alone)
+    assert candidates(QUERY_RULES["information"], given)[0] == np.argmax(alone)
+
+
+def from_start(start, *, steps=2):
+    states = np.arange(steps + 1.0)[:, None] + start
+    return Trajectory(states, np.zeros((steps, 1)), np.zeros(steps))
+
+
+def test_an_opponent_is_from_the_same_start_where_there_is_one():
+    trajectories = [from_start(start) for start in (0, 5, 0, 5, 0, 9)]
+    assert same_starts(trajectories) == [[0, 2, 4], [1, 3], [5]]
+
+    def opponents(undominated, favourites=()):
+        return opponents_from_the_same_start(trajectories, Preferences(undominated=undominated), favourites)
+
+    assert opponents(()) == {0: 2, 2: 0, 4: 0, 1: 3, 3: 1}  # the first other one; 5 is alone
+    assert opponents((2, 3)) == {0: 2, 2: 0, 4: 2, 1: 3, 3: 1}  # the one that was shown and not beaten
+    assert opponents((2, 0)) == {0: 2, 2: 0, 4: 0, 1: 3, 3: 1}  # the newest of those
+    assert opponents((), favourites=(3, 4)) == {0: 4, 2: 4, 4: 0, 1: 3, 3: 1}
+
+
+def test_rivals_are_the_undominated_of_the_start_and_all_across_starts():
+    trajectories = [from_start(start) for start in (0, 5, 0, 5, 0, 9)]
+    preferences = Preferences(undominated=(1, 0, 2))
+    assert rivals(show(1, 4, 2, trajectories, rng=np.random.default_rng(0)), trajectories, preferences) == [0, 2]
+    assert rivals(show(1, 5, 2, trajectories, rng=np.random.default_rng(0)), trajectories, preferences) == [1, 0, 2]
+
+
+def test_the_first_questions_are_about_each_pair_from_one_start_once():
+    rng = np.random.default_rng(0)
+    chosen = first_questions(range(4), {0: 1, 1: 0, 2: 3, 3: 2}, Questions(), rng=rng)
+    assert sorted(zip(chosen.candidates, chosen.opponents, strict=True)) == [(1, 0), (3, 2)]
+    assert chosen.wanted == 2
+    assert first_questions(range(4), {}, Questions(answers=1), rng=rng).wanted == 1
+    assert first_questions(range(4), {}, Questions(), rng=rng).opponents is None
+
+
+def test_a_question_is_left_out_whose_answer_would_tell_nothing():
+    def chosen(draws, **options):
+        given = situation(draws, ZERO)
+        given.estimate.posterior = "drawn"
+        return later_questions(QUERY_RULES["information"], given, Questions(**options))
+
+    foreseeable = np.full((4, 3), 9.0)
+    assert chosen(foreseeable).wanted == 1
+    worthless = chosen(foreseeable, worthwhile=True)
+    assert (worthless.wanted, worthless.information) == (0, pytest.approx(0, abs=1e-9))
+    open_one = chosen(DRAWS, worthwhile=True)
+    assert open_one.wanted == 1
+    assert open_one.information > LEAST_INFORMATION
+
+
+def test_nothing_is_asked_once_the_budget_is_spent():
+    estimate = SimpleNamespace(quality=SimpleNamespace(converged=True))
+    options = Questions(answers=3)
+    assert not options.skips(Preferences(((0, 1),), (0,), 2), 0, estimate, 0.9)
+    assert options.skips(Preferences(((0, 1),), (0,), 3), 0, estimate, 0.9)
 
 
 def test_three_lines_make_a_rule_of_ones_own():

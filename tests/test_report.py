@@ -34,7 +34,7 @@ from bayespbrl.models.likelihoods import log_prob
 from bayespbrl.runs.iteration_files import read_iteration
 from bayespbrl.trajectories import trajectory_features
 
-QUICK = {"iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
+QUICK = {"preset": "paper", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
 
 
 def start(directory, **changes):

@@ -25,9 +25,16 @@ from bayespbrl.policies import TabularPolicy
 from bayespbrl.runs import directory as run_directory
 from bayespbrl.runs import run as runs
 from bayespbrl.runs.directory import PartialLine, RunDirectory, read_log_lines
-from bayespbrl.settings import PRESETS
+from bayespbrl.settings.presets import PAPER
 
-QUICK = {"utility": "linear-program", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
+QUICK = {
+    "preset": "paper",
+    "utility": "linear-program",
+    "iterations": 3,
+    "max_steps": 20,
+    "evaluation_episodes": 3,
+    "seed": 7,
+}
 FILES = {"settings.json", "events.jsonl", "summary.json", "iterations"}
 
 
@@ -167,7 +174,7 @@ def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):
 
 def test_settings_come_back_as_they_were_kept_whatever_the_preset_says_today(tmp_path):
     start(tmp_path / "run").ask()
-    with mock.patch.dict(PRESETS["gridworld"], {"trajectory_discount": 1.0}):
+    with mock.patch.dict(PAPER["gridworld"], {"trajectory_discount": 1.0}):
         assert bayespbrl.load(tmp_path / "run").settings.estimation.trajectory_discount is None
         assert start(tmp_path / "new").settings.estimation.trajectory_discount == 1.0
 
@@ -624,7 +631,13 @@ class Corridor(gymnasium.Env):
 
 @pytest.mark.slow
 def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_come_back(tmp_path):
-    options = {"utility": "linear-program", "iterations": 2, "max_steps": 12, "evaluation_episodes": 2}
+    options = {
+        "preset": "paper",
+        "utility": "linear-program",
+        "iterations": 2,
+        "max_steps": 12,
+        "evaluation_episodes": 2,
+    }
     directory = tmp_path / "run"
     learner = bayespbrl.start(Corridor(), directory, **options).run(ReturnExpert())
     assert len({len(trajectory) for trajectory in learner.trajectories}) > 1
@@ -680,7 +693,14 @@ def test_an_environment_as_its_name_makes_it_need_not_be_passed_again(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("policy", ["linear-gaussian", "gaussian-process"])
 def test_a_run_with_continuous_actions_comes_back_and_goes_on_bit_for_bit(tmp_path, policy):
-    options = {"utility": "linear-program", "iterations": 2, "evaluation_episodes": 2, "centres": 20, "max_steps": 15}
+    options = {
+        "preset": "paper",
+        "utility": "linear-program",
+        "iterations": 2,
+        "evaluation_episodes": 2,
+        "centres": 20,
+        "max_steps": 15,
+    }
     whole = bayespbrl.start("swing-up", tmp_path / "whole", policy=policy, **options).run(ReturnExpert())
     stopped = bayespbrl.start("swing-up", tmp_path / "stopped", policy=policy, **options)
     for _ in range(2):

@@ -1,5 +1,6 @@
 """Schedules of the KL bound: what they decide from, and what a run makes of it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -103,8 +104,20 @@ def test_a_posterior_that_has_not_converged_never_raises_the_bound():
     assert ConfidenceBound()(situation(update, converged=False, usual=0.05)).kl_bound == 0.05
     assert "not converged" in ConfidenceBound()(situation(update, converged=False)).reason
     at_odds = proposed(np.column_stack([mean, -0.5 * mean]))
-    assert ConfidenceBound()(situation(at_odds, converged=False)).kl_bound < 0.05
+    assert ConfidenceBound()(situation(at_odds, converged=False)).kl_bound == LEAST_BOUND
     assert ConfidenceBound()(situation(proposed(), usual=0.27)).kl_bound == 0.27  # no posterior
+
+
+def test_the_signal_counts_the_sampling_error_of_q_beside_the_utilitys():
+    update = proposed(np.column_stack([proposed().q_values] * 10))
+    whole = ConfidenceBound()(situation(update))
+    halves = np.random.default_rng(0).normal(size=(len(update.q_values), 2, 3))
+    halves += 2 * update.q_values[:, None, None] / update.q_values.std()
+    doubtful = replace(update, q_halves=halves)
+    assert 0.1 < doubtful.reliability < 1
+    assert ConfidenceBound()(situation(doubtful)).signal == pytest.approx(whole.signal * doubtful.reliability)
+    alone = ConfidenceBound()(situation(replace(doubtful, q_draws=None)))  # the known reward
+    assert (alone.signal, alone.kl_bound) == (doubtful.reliability, doubtful.reliability**2)
 
 
 def test_the_constant_bound_is_the_runs_or_its_own():
@@ -152,7 +165,7 @@ def test_bad_options_are_refused(largest):
         ConfidenceBound(largest)
 
 
-QUICK = {"utility": "linear-program", "max_steps": 20, "evaluation_episodes": 3}
+QUICK = {"preset": "paper", "utility": "linear-program", "max_steps": 20, "evaluation_episodes": 3}
 
 
 def three_lines(situation):
@@ -173,7 +186,9 @@ def test_a_run_follows_a_schedule_of_the_users_own_records_why_and_goes_on_with_
 
 
 def test_the_bound_follows_the_posterior_of_a_run_and_comes_from_the_same_choices():
-    learner = Learner("gridworld", schedule="confidence", iterations=3, evaluation_episodes=5).run(ReturnExpert())
+    learner = Learner("gridworld", preset="paper", schedule="confidence", iterations=3, evaluation_episodes=5).run(
+        ReturnExpert()
+    )
     for summary in learner.iterations:
         assert LEAST_BOUND <= summary["kl_bound"] <= 1
         assert 0 <= summary["schedule"]["signal"] <= 1
@@ -181,8 +196,6 @@ def test_the_bound_follows_the_posterior_of_a_run_and_comes_from_the_same_choice
         assert summary["schedule"]["rhat_max"] == summary["rhat_max"]
 
 
-def test_a_schedule_that_asks_the_posterior_needs_one():
-    with pytest.raises(ValueError, match="schedule: expected constant with linear-program, no posterior"):
-        Learner("gridworld", schedule="confidence", utility="linear-program")
+def test_a_schedule_of_the_users_own_has_to_be_given():
     with pytest.raises(ValueError, match="schedule: expected a function of the user's own beside 'other'"):
         Learner("gridworld", schedule="other")

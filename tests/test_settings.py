@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.envs import SHORT_NAMES
-from bayespbrl.presets import PRESETS
 from bayespbrl.settings import OPTIONS, Settings, settings_for
+from bayespbrl.settings.presets import DEFAULT, IDS, PAPER, TASKS, Task
 
 NAN, INFINITY = float("nan"), float("inf")
 BAD = {
@@ -46,6 +47,12 @@ BAD = {
     "hyperparameters": ["chosen", None],
     "utility_bandwidth_factor": [0, -1.0, NAN],
     "normalised_utility": [None, 1, "yes"],
+    "preset": ["fast", "", None],
+    "answers": [0, -1, 2.5, True],
+    "same_start": [None, 1, "yes"],
+    "worthwhile": [None, 1, "yes"],
+    "checked": [None, 1, "yes"],
+    "critic_iterations": [0, -4, True, 2.0],
 }
 
 
@@ -70,8 +77,8 @@ def test_every_option_is_checked():
     assert set(OPTIONS) == set(BAD)
 
 
-def test_the_defaults_are_the_papers_protocol():
-    settings = settings_for("gridworld")
+def test_the_paper_preset_is_the_papers_protocol():
+    settings = settings_for("gridworld", preset="paper")
     assert (settings.iterations, settings.rollouts.trajectories_per_iteration) == (25, 10)
     assert Settings("any").critic.discount == 0.98
     assert settings.critic.discount == 0.995  # the one departure, argued beside the preset
@@ -80,6 +87,8 @@ def test_the_defaults_are_the_papers_protocol():
     assert (questions.first_queries, questions.queries_per_iteration) == (2, 1)
     assert (settings.estimation.utility, settings.model.likelihood) == ("posterior-mean", "mixed")
     assert settings.rollouts.evaluation_episodes == 100
+    assert (questions.answers, questions.query, settings.update.schedule) == (None, "highest-utility", "constant")
+    assert (settings.update.updates_per_iteration, settings.update.checked, questions.same_start) == (1, False, False)
 
 
 def test_an_unknown_option_is_refused_by_name():
@@ -88,10 +97,12 @@ def test_an_unknown_option_is_refused_by_name():
 
 
 def test_changes_win_over_presets_and_none_changes_nothing():
-    preset = settings_for("gridworld")
-    assert settings_for("gridworld", kl_bound=None, seed=None, iterations=None) == preset
+    preset = settings_for("gridworld", preset="paper")
+    assert settings_for("gridworld", preset="paper", kl_bound=None, seed=None, iterations=None) == preset
     assert settings_for("gridworld", iterations=7).iterations == 7
-    assert settings_for("SomebodysEnv-v3") == Settings("SomebodysEnv-v3")
+    paper = settings_for("SomebodysEnv-v3", preset="paper", hyperparameters="inferred")
+    assert paper == Settings("SomebodysEnv-v3", preset="paper")
+    assert settings_for("SomebodysEnv-v3") == Settings.from_options("SomebodysEnv-v3", DEFAULT)
 
 
 def test_steepness_and_lapse_rate_are_inferred_unless_they_or_all_hyperparameters_are_given():
@@ -105,15 +116,59 @@ def test_steepness_and_lapse_rate_are_inferred_unless_they_or_all_hyperparameter
     assert (model.steepness, model.lapse_rate) == (5.0, 0.2)
 
 
-@pytest.mark.parametrize("env", PRESETS)
-def test_every_preset_is_valid_and_survives_json(env):
-    settings = settings_for(env, seed=5)
+TASK = Task(Box(-1.0, 1.0, (3,)), Box(-1.0, 1.0, (1,)), horizon=200)
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("env", [*PAPER, "SomebodysEnv-v3"])
+def test_every_preset_is_valid_and_survives_json(env, preset):
+    settings = settings_for(env, seed=5, preset=preset, task=TASK)
+    assert settings.preset == preset
     assert Settings.from_options(env, json.loads(json.dumps(settings.options()))) == settings
 
 
 @pytest.mark.parametrize(("short", "name"), SHORT_NAMES.items())
-def test_a_preset_is_found_by_short_name_and_by_id(short, name):
-    assert PRESETS[name] is PRESETS[short]
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_a_preset_is_found_by_short_name_and_by_id(short, name, preset):
+    assert IDS[name] == short
+    assert settings_for(name, preset=preset).options() == settings_for(short, preset=preset).options()
+    assert TASKS[short].items() <= settings_for(short).options().items()
+
+
+def test_the_default_derives_from_spaces_and_horizon_what_tasks_differ_in():
+    def derived(task):
+        settings = settings_for("SomebodysEnv-v3", task=task)
+        return settings.critic.discount, settings.rollouts.exploration_hold, settings.features.bandwidth_factor
+
+    assert derived(TASK) == (0.98, 5, 0.5)
+    assert derived(Task(Box(-1.0, 1.0, (4,)), Discrete(2), horizon=500)) == (0.992, 1, 1.0)
+    assert derived(Task(Box(-1.0, 1.0, (17,)), Box(-1.0, 1.0, (6,)), horizon=1000)) == (0.995, 25, 2.0)
+    assert settings_for("SomebodysEnv-v3", task=TASK, discount=0.9).critic.discount == 0.9
+
+
+def test_iterations_follow_from_the_budget_of_answers():
+    settings = settings_for("SomebodysEnv-v3", answers=6)
+    assert (settings.iterations, settings.most_iterations) == (None, 14)
+    assert not settings.finished(iteration=6, answers=5, unasked=4)
+    assert not settings.finished(iteration=9, answers=6, unasked=4)
+    assert settings.finished(iteration=9, answers=6, unasked=5)  # the policy has caught up with the last answer
+    assert settings.finished(iteration=13, answers=3, unasked=10)  # nothing was worth asking
+    assert settings.finished(iteration=14, answers=5, unasked=0)
+    paper = settings_for("gridworld", preset="paper")
+    assert not paper.finished(iteration=24, answers=99, unasked=20)
+    assert paper.finished(iteration=25, answers=0, unasked=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "query"),
+    [
+        ({"utility": "known-reward"}, "highest-utility"),
+        ({"schedule": "constant"}, "highest-utility"),
+        ({"schedule": "constant", "query": "thompson"}, "thompson"),
+    ],
+)
+def test_a_choice_that_rules_out_the_default_question_takes_the_papers(options, query):
+    assert settings_for("SomebodysEnv-v3", **options).questions.query == query
 
 
 @pytest.mark.parametrize("value", [1e-6, 1, np.float64(0.3)])

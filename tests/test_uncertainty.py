@@ -26,7 +26,7 @@ from bayespbrl.diagnostics.uncertainty import (
     thinned,
 )
 from bayespbrl.features import OneHot
-from bayespbrl.improvement.q_function import estimate_q
+from bayespbrl.improvement.q_function import Evidence, estimate_q
 from bayespbrl.models import PreferenceModel
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
 from bayespbrl.utility.comparisons import Comparisons
@@ -142,7 +142,9 @@ def test_ranks_of_random_draws_agree_with_sorting_and_every_row_and_column_is_a_
 @pytest.fixture(scope="module")
 def grid():
     """Thirty trajectories of a uniform policy and the policy that follows from two answers."""
-    learner = Learner("gridworld", iterations=1, trajectories_per_iteration=30, evaluation_episodes=1, seed=3)
+    learner = Learner(
+        "gridworld", preset="paper", iterations=1, trajectories_per_iteration=30, evaluation_episodes=1, seed=3
+    )
     return learner.run(ReturnExpert())
 
 
@@ -171,6 +173,8 @@ def test_fewer_draws_of_q_are_some_of_all(gridworld_run):
 
 
 CONTINUOUS = {
+    "preset": "paper",
+    "hyperparameters": "inferred",
     "iterations": 1,
     "max_steps": 10,
     "trajectories_per_iteration": 4,
@@ -193,11 +197,10 @@ def test_q_of_each_draw_is_what_lstd_gives_for_its_utilities_alone():
     for number in (0, 77, 199):
         alone = estimate_q(
             learner.policy,
-            steps,
-            utilities[number],
+            Evidence(steps, utilities[number]),
             key=jax.random.key(2),
             action_space=learner.environment.action_space,
-            features=learner.feature_source.of_steps(
+            features=learner.cycle.feature_source.of_steps(
                 steps, learner.settings.features.of_critic, rng=np.random.default_rng(2)
             ),
             critic=learner.settings.critic,

@@ -26,17 +26,20 @@ Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot,
 
 # The options of a run and of each trial, with their help. One left out has the value of the environment's preset.
 RUN_OPTIONS = {
+    "answers": "Budget: the most answers that are asked for (default 20, ties included; iterations follow from it).",
+    "preset": "default: one for any task; or paper: the paper's protocol, with its constant KL bound.",
     "utility": "Estimate of the utility: posterior-mean, most-likely, posterior-draw, linear-program, or known-reward "
     "(a reference run trained on the hidden reward).",
-    "query": "Rule that selects the trajectories to ask about: highest-utility (the paper's), probably-better, "
-    "thompson, information, disagreement or information-when-unsure.",
-    "schedule": "KL bound of each update: constant (the paper's), or confidence, which scales it with the posterior's "
-    "confidence that the update is an improvement.",
+    "query": "Rule that selects the trajectories to ask about: information-when-unsure (default), highest-utility (the "
+    "paper's), probably-better, thompson, information or disagreement.",
+    "schedule": "KL bound of each update: confidence (default), which scales it with the confidence that the update is "
+    "an improvement, or constant (the paper's).",
     "hyperparameters": "Length scales, steepness and lapse rate: inferred (part of the posterior, unless --steepness "
     "or --lapse-rate sets one) or given (as set, or the paper's).",
-    "iterations": "Number of cycles of the four steps.",
+    "iterations": "Maximum number of cycles of the four steps; by default they follow from the answers.",
     "kl_bound": "KL bound of each policy update, in nats.",
     "updates_per_iteration": "Maximum number of policy updates per iteration; the paper's is 1.",
+    "same_start": "Whether a question compares two trajectories from the same start, where resets by seed allow it.",
     "unasked_iterations": "Maximum number of consecutive iterations without a question (at most half the answers so "
     "far); with the schedule confidence only while its confidence is high; the paper's is 0.",
     "likelihood": "Likelihood of an answer: mixed (eq. 8), logistic or probit.",

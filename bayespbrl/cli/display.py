@@ -38,6 +38,8 @@ def show_run(learner: Learner, directory: Path) -> None:
     from bayespbrl.diagnostics.plots import run_figure
 
     _print_iterations(learner)
+    if learner.comparable_starts is False:
+        console.print("Equal seeds did not start alike here: trajectories from different starts were compared.")
     film, picture = _film(learner, directory), directory / PICTURE
     run_figure(learner).savefig(picture, dpi=110)
     console.print(f"Run directory: {directory}\nPicture: {picture}\n{film}")
@@ -55,7 +57,7 @@ def _film(learner: Learner, directory: Path) -> str:
 def _run_with_bar(learner: Learner) -> None:
     console.print("The simulated expert answers according to the hidden reward.")
     with progress_bar() as bar:
-        total, done = learner.settings.iterations, learner.state.iteration
+        total, done = learner.settings.most_iterations, learner.state.iteration
         task = bar.add_task("iterations", total=total, completed=done, state=_state(learner))
         learner.run(
             simulated_expert(learner.settings.wrong_answers, seed=learner.settings.seed),

@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 from gymnasium import Space
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayespbrl import checks
 from bayespbrl.features import StateActionFeatures
 from bayespbrl.improvement.q_function import Critic
 from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.estimate import UtilityEstimate
+
+LEAST_TRANSITIONS = 5000  # that LSTD takes, where there are as many: some ten for each of its features
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,11 @@ class PolicyUpdate:
       updates_per_iteration: most updates of the policy from the same trajectories and utility, until it has moved by
         most of the bound. Each has the Q of the policy before it; all but the first hold a continuous policy's spread.
         The paper's is 1.
-      recent_iterations: the update takes the states of so many last iterations; None for those of all. LSTD always has
-        all transitions.
+      recent_iterations: the update takes the states of so many last iterations; None for those of all.
+      critic_iterations: LSTD takes the transitions of so many last iterations, but at least `LEAST_TRANSITIONS`; None
+        for those of all, as in the paper. Old ones say little of the current policy.
+      checked: whether each update is checked by the trajectories that follow it: the run keeps the policy that the
+        posterior thinks best, and goes on from there after a step back. The paper's learner never looks back.
       update_states: most of these states that the update takes, drawn at random, where they are continuous: it bounds
         time and memory for long episodes.
     """
@@ -37,15 +42,20 @@ class PolicyUpdate:
     schedule: str = "constant"
     updates_per_iteration: int = 1
     recent_iterations: int | None = None
+    critic_iterations: int | None = None
     update_states: int = 20_000
+    checked: bool = False
 
     def __post_init__(self) -> None:
         checks.positive("kl_bound", self.kl_bound)
         checks.one_of("schedule", self.schedule, ("constant", "confidence", "other"))
         checks.whole("updates_per_iteration", self.updates_per_iteration)
-        if self.recent_iterations is not None:
-            checks.whole("recent_iterations", self.recent_iterations)
+        for name in ("recent_iterations", "critic_iterations"):
+            if getattr(self, name) is not None:
+                checks.whole(name, getattr(self, name))
         checks.whole("update_states", self.update_states)
+        if not isinstance(self.checked, bool):
+            raise ValueError(f"checked: expected true or false, got {self.checked!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +63,16 @@ class UpdateProblem:
     """What all updates of one iteration share.
 
     Attributes:
-      steps: N transitions observed so far, under whatever policies.
+      steps: N observed transitions, under whatever policies.
       utilities: uᵢ of each.
-      states: those of the update, shape (n, S) or (n,); LSTD always has all transitions.
+      states: those of the update, shape (n, S) or (n,).
       critic: LSTD's options.
       state_action_features: φ(s, a) of Q.
       state_features: φ(s) of the constraint on the state distribution (eq. 11); not needed for discrete actions in
         continuous states.
       action_space: bounds the actions.
+      quarters: which quarter of the trajectories each transition is of, shape (N,); None where nobody asks for the
+        reliability of Q.
 
     Raises:
       ValueError: utilities that do not fit the transitions or are not finite.
@@ -73,6 +85,7 @@ class UpdateProblem:
     state_action_features: StateActionFeatures
     state_features: Callable[[np.ndarray], np.ndarray]
     action_space: Space[Any]
+    quarters: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.utilities.shape != (len(self.steps),):
@@ -101,6 +114,20 @@ def step_utilities(
         return utility.step_utilities(steps), None
     utilities, drawn = utility.utilities_and_draws(steps.next_states, number=draws)
     return utilities, drawn.T
+
+
+def recent(trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iteration: int) -> Sequence[Trajectory]:
+    """The trajectories whose transitions LSTD takes; arguments as of `states_of_update`."""
+    if options.critic_iterations is None:
+        return trajectories
+    lengths = np.cumsum([len(trajectory) for trajectory in reversed(trajectories)])
+    enough = 1 + int(np.searchsorted(lengths, LEAST_TRANSITIONS))
+    return trajectories[-max(enough, options.critic_iterations * an_iteration) :]
+
+
+def quarters(trajectories: Sequence[Trajectory]) -> Int[np.ndarray, " n"]:
+    """For each transition a quarter of the trajectories: every fourth is in the same."""
+    return np.repeat(np.arange(len(trajectories)) % 4, [len(trajectory) for trajectory in trajectories])
 
 
 def states_of_update(

@@ -1,7 +1,9 @@
 """Step 2, its critic: from the utilities of transitions to Q, by LSTD (paper, "Step 2")."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import chain, combinations
 from operator import add
 from typing import Any
 
@@ -44,55 +46,101 @@ class QFunction:
     Attributes:
       features: φ(s, a), from N states and N actions to (N, Q).
       weights: θ, shape (Q + 1,), or (Q + 1, n) for n utilities side by side; the last row is the bias.
+      halves: θ of the first utility from either half of the data alone, for each of several divisions into halves,
+        shape (Q + 1, 2, divisions); None without quarters.
     """
 
     features: StateActionFeatures
     weights: np.ndarray
+    halves: np.ndarray | None = None
 
     def __call__(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Q of N pairs, shape (N,), or (N, n)."""
-        return np.asarray(self.features(states, actions) @ self.weights[:-1] + self.weights[-1])
+        return self.with_halves(states, actions)[0]
+
+    def with_halves(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Q of N pairs, and that of the halves, shape (N, 2, divisions)."""
+        table = _with_bias(self.features(states, actions))
+        halves = None if self.halves is None else np.tensordot(table, self.halves, axes=1)
+        return table @ self.weights, halves
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What Q is estimated from.
+
+    Attributes:
+      steps: N transitions, under whatever policies.
+      utilities: uᵢ of each, shape (N,), or n of them side by side, (N, n).
+      quarters: which quarter of the trajectories each transition is of, 0 to 3, shape (N,): Q is also estimated from
+        half of the data, and what two halves disagree on is not told by the data; None: from all alone.
+    """
+
+    steps: Transitions
+    utilities: np.ndarray
+    quarters: np.ndarray | None = None
 
 
 def estimate_q(
     policy: Any,
-    steps: Transitions,
-    utilities: np.ndarray,
+    data: "Evidence",
     *,
     key: jax.Array,
     action_space: Space[Any],
     features: StateActionFeatures,
     critic: Critic,
 ) -> QFunction:
-    """LSTD-Q with a bias column, from every observed transition.
+    """LSTD-Q with a bias column, from every given transition.
 
     Args:
       policy: whose Q.
-      steps: N transitions, under whatever policies.
-      utilities: uᵢ of each, shape (N,), or n of them side by side, (N, n).
+      data: transitions and their utilities.
       key: for the fresh action in each next state, where actions cannot be enumerated.
       action_space: bounds the fresh actions.
       features: φ(s, a).
       critic: LSTD's options.
     """
-    steps, utilities, counts = _counted(steps, utilities)
+    steps = data.steps
     following = None if is_discrete(policy) else clipped(sample_actions(policy, key, steps.next_states), action_space)
+    parts = np.zeros(len(steps), int) if data.quarters is None else data.quarters
+    sums = [_sums(policy, data, following, features, np.flatnonzero(parts == part)) for part in np.unique(parts)]
+    weights = solve_lstd(reduce(add, sums), **vars(critic))
+    if len(sums) == 1:
+        return QFunction(features, weights)
+    first = [replace(part, target=part.target.reshape(len(part.gram), -1)[:, 0]) for part in sums]
+    halves = [solve_lstd(reduce(add, half), **vars(critic)) for half in chain.from_iterable(halvings(first))]
+    return QFunction(features, weights, np.reshape(halves, (-1, 2, len(weights))).T)
+
+
+def halvings(parts: Sequence[Any]) -> list[tuple[list[Any], list[Any]]]:
+    """All divisions of the parts into two halves of as many: three of four parts, one of two or three, else none."""
+    size = len(parts) // 2
+    firsts = [each for each in combinations(range(len(parts)), size) if 0 in each] if size else []
+    return [([parts[i] for i in each], [parts[i] for i in range(len(parts)) if i not in each]) for each in firsts]
+
+
+def _sums(
+    policy: Any, data: Evidence, following: np.ndarray | None, features: StateActionFeatures, rows: np.ndarray
+) -> TransitionSums:
+    """LSTD's sums over some of the transitions."""
+    chosen = Transitions(*(column[rows] for column in vars(data.steps).values()))
+    chosen, utilities, counts = _counted(chosen, data.utilities[rows])
+    following = None if following is None else following[rows]
 
     def sums(rows: slice) -> TransitionSums:
-        current = _with_bias(features(steps.states[rows], steps.actions[rows]))
+        current = _with_bias(features(chosen.states[rows], chosen.actions[rows]))
         if following is None:
-            successor = _expected_features(policy, steps.next_states[rows], features)
+            successor = _expected_features(policy, chosen.next_states[rows], features)
         else:
-            successor = features(steps.next_states[rows], following[rows])
+            successor = features(chosen.next_states[rows], following[rows])
         successor = _with_bias(successor)
-        successor[steps.terminal[rows]] = 0.0
+        successor[chosen.terminal[rows]] = 0.0
         repeats = np.sqrt(counts[rows])[:, None]  # a row times √n enters every Gram matrix as n rows
         return transition_sums(current * repeats, successor * repeats, (utilities[rows].T * repeats[:, 0]).T)
 
     # a block at a time: the features of all transitions would fill the memory of a long run
-    blocks = [slice(start, start + ROWS_AT_A_TIME) for start in range(0, len(steps), ROWS_AT_A_TIME)]
-    weights = solve_lstd(reduce(add, map(sums, blocks)), **vars(critic))
-    return QFunction(features, weights)
+    blocks = [slice(start, start + ROWS_AT_A_TIME) for start in range(0, len(chosen), ROWS_AT_A_TIME)]
+    return reduce(add, map(sums, blocks))
 
 
 def _counted(steps: Transitions, utilities: np.ndarray) -> tuple[Transitions, np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from bayespbrl import checks
 from bayespbrl.improvement.update import ProposedUpdate
 from bayespbrl.utility.estimate import UtilityEstimate
 
-LEAST_BOUND = 0.02  # nats; without any step the draws would have nothing to disagree about
+LEAST_BOUND = 0.05  # nats; without any step there would be nothing to learn from
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,10 @@ class ConfidenceBound:
     Each draw of the utility has a Q-function of its own (LSTD is linear in the utility). The direction in which REPS
     moves for the mean Q promises it the gain G = Σ WᵢAᵢQᵢ (`ProposedUpdate.gains`). An update of relative length s
     gains sG. The length in [0, 1] that maximises E[sG] − ½E[(sG)²]/E[G] is the *signal* s = E[G]²/(E[G]² + Var[G]). KL
-    grows with the square of the length, so the bound is s² times the largest. The signal depends neither on the unit of
-    the utility nor on any bound. Where the mean expects no gain the bound is the least; a posterior that has not
-    converged never raises it above the run's own.
+    grows with the square of the length, so the bound is s² times the largest. What the draws share is Q's own sampling
+    error; the signal is therefore multiplied with the reliability of Q (`ProposedUpdate.reliability`). The signal
+    depends neither on the unit of the utility nor on any bound. Where the mean expects no gain the bound is the least;
+    a posterior that has not converged never raises it above the run's own.
 
     Attributes:
       largest: the bound when all draws expect the same gain, nats, > 0.
@@ -109,15 +110,19 @@ class ConfidenceBound:
             "rhat_max": float(quality.rhat_max),
             "effective_sample_size_min": float(quality.effective_sample_size_min),
         }
-        if update.q_draws is None:
+        if update.q_draws is None and update.q_halves is None:
             return Bound(usual, "no posterior: the run's own bound", statistics=statistics)
-        gains = update.gains()
-        square = float(np.mean(gains)) ** 2
-        total = square + float(np.var(gains))
-        signal = square / total if total > 0 and np.mean(gains) > 0 else 0.0
-        statistics["agreement"] = float(np.mean(gains > 0))
+        signal = statistics["reliability"] = update.reliability
+        reason = f"reliability of Q {signal:.2f}"
+        if update.q_draws is not None:
+            gains = update.gains()
+            square = float(np.mean(gains)) ** 2
+            total = square + float(np.var(gains))
+            signal *= square / total if total > 0 and np.mean(gains) > 0 else 0.0
+            statistics["agreement"] = float(np.mean(gains > 0))
+            reason = f"{statistics['agreement']:.0%} of the draws expect a gain, {reason}"
         bound = max(LEAST_BOUND, signal**2 * self.largest)
-        reason = f"{statistics['agreement']:.0%} of the draws expect a gain; signal {signal:.2f}"
+        reason = f"{reason}; signal {signal:.2f}"
         if not quality.converged and bound > usual:
             return Bound(usual, f"{reason}; not converged: at most the run's own bound", signal, statistics)
         return Bound(bound, reason, signal, statistics)

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from bayespbrl import checks
 from bayespbrl.improvement.problem import UpdateProblem
-from bayespbrl.improvement.q_function import QFunction, estimate_q
+from bayespbrl.improvement.q_function import Evidence, QFunction, estimate_q
 from bayespbrl.improvement.reps import (
     RepsSolution,
     WhitenedFeatures,
@@ -43,6 +43,7 @@ class ProposedUpdate:
         state, shape (N,) int, where the constraint holds for every single state.
       base_weights: Wᵢ, shape (N,).
       q_draws: Qᵢ under each of S posterior draws of the utility, shape (N, S); None without a posterior.
+      q_halves: Qᵢ by either half of the data, for each of m divisions into halves; None where it was not asked for.
     """
 
     policy: Any
@@ -53,6 +54,7 @@ class ProposedUpdate:
     state_features: Float[np.ndarray, "n d"] | Int[np.ndarray, " n"]
     base_weights: Float[np.ndarray, " n"]
     q_draws: Float[np.ndarray, "n s"] | None = None
+    q_halves: Float[np.ndarray, "n 2 m"] | None = None
     solved: dict[float, RepsSolution] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -85,6 +87,23 @@ class ProposedUpdate:
             promised = advantages(self.q_values, self.constraint, self.base_weights)
             return np.asarray((self.base_weights * promised) @ self.q_draws)
         return np.asarray((self.solve(kl_bound).probabilities - self.base_weights) @ self.q_draws)
+
+    @cached_property
+    def reliability(self) -> float:
+        """Share of the variance of the advantages that is no sampling error of Q; 1 without halves.
+
+        Source: Spearman (1910) and Brown (1910): 2r/(1 + r), with r the correlation of the advantages by the Q of two
+        halves of the data, in the mean over the divisions into halves.
+        """
+        if self.q_halves is None:
+            return 1.0
+        correlations = []
+        for division in self.q_halves.T:  # (2, N)
+            first, second = (advantages(q, self.constraint, self.base_weights) for q in division)
+            product = (self.base_weights @ first**2) * (self.base_weights @ second**2)
+            correlations.append(self.base_weights @ (first * second) / np.sqrt(product) if product > 0 else 0.0)
+        correlation = max(float(np.mean(correlations)), 0.0)
+        return 2 * correlation / (1 + correlation)
 
     def agreement(self, kl_bound: float | None = None) -> float:
         """Share of the draws that expect a gain."""
@@ -152,8 +171,7 @@ def propose(
     next_key, fresh_key = jax.random.split(key)
     q_functions = estimate_q(
         policy,
-        problem.steps,
-        columns,
+        Evidence(problem.steps, columns, problem.quarters),
         key=next_key,
         action_space=problem.action_space,
         features=problem.state_action_features,
@@ -167,7 +185,8 @@ def propose(
         actions = sample_actions(policy, fresh_key, states)
     # Q is of the action that the environment would see. The fit is of the action that the policy drew: fitting clipped
     # ones would shrink the policy at every update.
-    q_values = q_functions(states[rows], clipped(actions, problem.action_space)).reshape(len(rows), -1)
+    q_values, q_halves = q_functions.with_halves(states[rows], clipped(actions, problem.action_space))
+    q_values = q_values.reshape(len(rows), -1)
     # Decision: where the actions of continuous states can be enumerated, the constraint holds at every single state.
     # Radial basis functions would let the weights move between states, which no policy can follow.
     each_state = is_discrete(policy) and states.ndim > 1
@@ -180,6 +199,7 @@ def propose(
         rows if each_state else problem.constrained[rows],
         base_weights,
         q_values[:, 1:] if q_values.shape[1] > 1 else None,
+        q_halves,
     )
 
 

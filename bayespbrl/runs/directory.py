@@ -194,7 +194,8 @@ class RunDirectory:
             "env": self.settings.env,
             "utility": self.settings.estimation.utility,
             "seed": self.settings.seed,
-            "finished": state.iteration >= self.settings.iterations,
+            "finished": not state.collected
+            and self.settings.finished(state.iteration, state.preferences.answers, state.unasked),
             "answers": state.preferences.answers,
             "iterations": list(state.summaries),
         }

@@ -11,6 +11,7 @@ import xarray as xr
 from bayespbrl import checks, runs
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.experts import simulated_expert
+from bayespbrl.learner import task_of
 from bayespbrl.rollouts import open_environment
 from bayespbrl.runs.directory import RunDirectory, read_summary
 from bayespbrl.settings import Settings, settings_for
@@ -91,8 +92,8 @@ def run_trials(
         raise ValueError(f"{directory}: expected a directory for the trials, got a file")
     environment = open_environment(env)
     identity = environment_name(environment)
+    first = settings_for(env, task=task_of(environment, settings.get("max_steps")), **settings, seed=seeds.start)
     environment.close()
-    first = settings_for(env, **settings, seed=seeds.start)
     if first.expert != "return":
         raise ValueError(f"expert: expected return, since trials are simulated, got {first.expert!r}")
     within = PREFERENCE_WITHIN.get(identity) if preference_within is None else preference_within

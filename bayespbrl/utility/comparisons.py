@@ -36,17 +36,28 @@ class Comparisons:
         *,
         discount: float,
         ties: Sequence[tuple[int, int]] = (),
+        shown_first: Sequence[tuple[tuple[int, int], int]] = (),
     ) -> "Comparisons":
-        """Those of `trajectories` that `pairs` and `ties` name, or the first where they name none."""
+        """Those of `trajectories` that `pairs` and `ties` name, or the first where they name none.
+
+        Args:
+          trajectories: by number.
+          pairs, ties: of their numbers.
+          discount: γ of ψ.
+          shown_first: as of `Preferences`; where there is any, a side bias is inferred.
+        """
         every = (*pairs, *ties)
         numbers = sorted({number for pair in every for number in pair} or {0})
         row = {number: position for position, number in enumerate(numbers)}
-        tied = np.arange(len(every)) >= len(pairs)
+        tied, sides = np.arange(len(every)) >= len(pairs), dict(shown_first)
         return cls(
             tuple(trajectories[n] for n in numbers),
             tuple((row[i], row[j]) for i, j in every),
             discount,
-            Answers(indifferent=tied if ties else None),
+            Answers(
+                indifferent=tied if ties else None,
+                shown_first=np.array([sides.get((i, j), 0) for i, j in every]) if sides else None,
+            ),
         )
 
     @property

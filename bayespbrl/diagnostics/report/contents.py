@@ -63,7 +63,9 @@ class RunContents:
     @property
     def finished(self) -> bool:
         """Whether all iterations are completed."""
-        return len(self.iterations) >= self.settings.iterations
+        answers = [summary["answers"] for summary in self.iterations]
+        unasked = next((n for n, before in enumerate(reversed(answers[:-1])) if before != answers[-1]), 0)
+        return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked)
 
     @property
     def posterior(self) -> xr.DataTree | None:

@@ -115,11 +115,11 @@ def _section(name: str, title: str, build: Callable[[], Body], failures: list[Re
 
 
 def _state(contents: RunContents) -> str:
-    done, wanted = len(contents.iterations), contents.settings.iterations
+    done, wanted = len(contents.iterations), contents.settings.most_iterations
     if contents.finished:
         return f"Finished: {done} iterations."
     question = "" if contents.open_question is None else f" Question {contents.open_question} waits for an answer."
-    text = f"In progress: {done} of {wanted} iterations.{question} "
+    text = f"In progress: {done} of at most {wanted} iterations.{question} "
     if contents.settings.own_parts:
         return text + f"Continue it in Python with bayespbrl.resume({str(contents.path)!r}) and your own objects."
     return text + f"Continue it with: bayespbrl resume {contents.path}"

@@ -13,10 +13,12 @@ from bayespbrl.features import RadialBasisOptions
 from bayespbrl.improvement.problem import PolicyUpdate
 from bayespbrl.improvement.q_function import Critic
 from bayespbrl.models import PreferenceModel
-from bayespbrl.presets import PRESETS
 from bayespbrl.queries import Questions
+from bayespbrl.settings.presets import Task, preset_options
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 
+LAST_ITERATIONS = 5  # after the last answer: the policy catches up with what is known
+MOST_UNASKED = 10  # in a row; then more answers would change little
 POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
 
 
@@ -98,7 +100,8 @@ class Settings:
     Attributes:
       env: a short name, a gymnasium id, or how an environment object describes itself.
       seed: of every random choice of the run.
-      iterations: cycles of the four steps.
+      preset: `default`, or `paper`, the paper's protocol; all other options say what it came to.
+      iterations: most cycles of the four steps; None: they follow from the budget of answers.
       environment: `named`, which `env` opens again, or `other`, an object of the user's.
       expert, wrong_answers: who answers, and the share of a simulated expert's answers that are reversed; a stopped run
         finds its expert again by them.
@@ -106,8 +109,9 @@ class Settings:
     """
 
     env: str
+    preset: str = "default"
     seed: int = 0
-    iterations: int = 25
+    iterations: int | None = 25
     environment: str = "named"
     expert: str = "return"
     wrong_answers: float = 0.0
@@ -121,7 +125,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         checks.whole("seed", self.seed, 0)
-        checks.whole("iterations", self.iterations)
+        checks.one_of("preset", self.preset, ("default", "paper"))
+        if self.iterations is not None:
+            checks.whole("iterations", self.iterations)
+        elif self.questions.answers is None:
+            raise ValueError("iterations: expected a number without a budget of answers, got None")
         checks.one_of("environment", self.environment, ("named", "other"))
         checks.one_of("expert", self.expert, ("return", "terminal", "other"))
         checks.share("wrong_answers", self.wrong_answers)
@@ -130,10 +138,8 @@ class Settings:
     def _check_together(self) -> None:
         """What one part's option asks of another part's."""
         utility, query, schedule = self.estimation.utility, self.questions.query, self.update.schedule
-        if utility in WITHOUT_POSTERIOR:
-            for name, value, usual in (("schedule", schedule, "constant"), ("query", query, "highest-utility")):
-                if value not in (usual, "other"):
-                    raise ValueError(f"{name}: expected {usual} with {utility}, no posterior, got {value!r}")
+        if utility in WITHOUT_POSTERIOR and query not in ("highest-utility", "other"):
+            raise ValueError(f"query: expected highest-utility with {utility}, no posterior, got {query!r}")
         if query == "information-when-unsure" and schedule != "confidence":
             raise ValueError(f"schedule: expected confidence with the query {query}, got {schedule!r}")
         number = self.rollouts.trajectories_per_iteration
@@ -164,6 +170,23 @@ class Settings:
         return {name: getattr(getattr(self, part) if part else self, name) for name, part in OPTIONS.items()}
 
     @property
+    def most_iterations(self) -> int:
+        """The limit that holds: `iterations`, else three for every two answers, and the last ones."""
+        budget = self.questions.answers
+        if self.iterations is None:
+            assert budget is not None
+            return 3 * budget // 2 + LAST_ITERATIONS
+        return self.iterations
+
+    def finished(self, iteration: int, answers: int, unasked: int) -> bool:
+        """Whether a run ends after so many iterations and answers, with so many iterations in a row unasked."""
+        if iteration >= self.most_iterations:
+            return True
+        if self.questions.answers is None:
+            return False
+        return unasked >= (LAST_ITERATIONS if answers >= self.questions.answers else MOST_UNASKED)
+
+    @property
     def own_parts(self) -> tuple[str, ...]:
         """The parts that are objects of the user's and have to be passed again to go on, or the expert."""
         return tuple(name for name, value in self.options().items() if value == "other")
@@ -190,11 +213,16 @@ OPTIONS: dict[str, str] = {f.name: "" for f in fields(Settings) if f.name not in
 }
 
 
-def settings_for(env: str, **changes: Any) -> Settings:
-    """The preset of a domain (the defaults, for an environment without one) with `changes`; None changes nothing.
+def settings_for(env: str, *, task: Task | None = None, **changes: Any) -> Settings:
+    """The preset for an environment with `changes`; None changes nothing.
+
+    Args:
+      env: short name or gymnasium id.
+      task: what the default preset derives options from; None: it derives none.
+      **changes: options, named alone.
 
     Raises:
       ValueError: as `Settings.from_options`.
     """
     chosen = {name: value for name, value in changes.items() if value is not None}
-    return Settings.from_options(env, PRESETS.get(env, {}) | chosen)
+    return Settings.from_options(env, preset_options(env, chosen, task) | chosen)

@@ -1,0 +1,240 @@
+"""The cycle: the four steps in their order (paper, "Online Preference-Based Reinforcement Learning").
+
+Each method takes what the learner knows and returns the next event; none changes anything.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+
+from bayespbrl import events, queries, rollouts
+from bayespbrl.events import Entry, LearnerState
+from bayespbrl.features import FeatureSource
+from bayespbrl.improvement import schedules
+from bayespbrl.improvement.check import Check, checked
+from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
+from bayespbrl.improvement.schedules import Bound, Situation
+from bayespbrl.improvement.update import Improvement, apply_update, propose
+from bayespbrl.preferences import opponents_from_the_same_start, rivals
+from bayespbrl.queries import QuerySituation
+from bayespbrl.settings import Settings
+from bayespbrl.trajectories import Trajectory, transitions
+from bayespbrl.utility.comparisons import Comparisons
+from bayespbrl.utility.estimate import UtilityEstimate
+from bayespbrl.utility.inference import estimate
+
+# Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS = range(9)
+# Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
+SCHEDULE_DRAWS = 100
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What stays the same over a run.
+
+    Attributes:
+      settings: all options.
+      environment: opened.
+      feature_source: draws the features.
+      schedule, query_rule: of the KL bound, and of the questions.
+    """
+
+    settings: Settings
+    environment: gymnasium.Env
+    feature_source: FeatureSource
+    schedule: schedules.Schedule
+    query_rule: queries.QueryRule
+
+    def collect(self, state: LearnerState) -> Entry:
+        """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
+        options, questions = self.settings.rollouts, self.settings.questions
+        began = time.perf_counter()
+        collected = rollouts.rollout(
+            self.environment,
+            state.policy,
+            key=self._key(COLLECT, state.iteration),
+            episodes=options.trajectories_per_iteration,
+            max_steps=options.max_steps,
+            hold=options.exploration_hold,
+            starts=self._starts(state) if questions.same_start else None,
+        )
+        chosen = self._chosen_questions(state, (*state.trajectories, *collected))
+        event = {
+            "event": "collected",
+            "iteration": state.iteration + 1,
+            **{name: value for name, value in vars(chosen).items() if value is not None},
+            "seconds": time.perf_counter() - began,
+        }
+        return _entry(event, trajectories=collected)
+
+    def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> queries.Chosen:
+        options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)
+        new, best = range(len(state.trajectories), len(known)), self._of_iteration(state.best)
+        opponents = opponents_from_the_same_start(known, state.preferences, best) if options.same_start else {}
+        if state.estimate is None:
+            return queries.first_questions(new, opponents, options, rng=rng)
+        signal = None if state.bound is None else state.bound.signal
+        if options.skips(state.preferences, state.unasked, state.estimate, signal):
+            return queries.Chosen()
+        incumbent = state.preferences.undominated[-1]
+        situation = QuerySituation(new, known, state.shown, incumbent, state.estimate, signal, rng, opponents)
+        return queries.later_questions(self.query_rule, situation, options)
+
+    def _of_iteration(self, number: int) -> range:
+        """The numbers of the trajectories of an iteration, from 0."""
+        each = self.settings.rollouts.trajectories_per_iteration
+        return range(number * each, (number + 1) * each)
+
+    def _starts(self, state: LearnerState) -> list[int]:
+        """The seeds of the resets, the same in each iteration; in the first each start has two trajectories."""
+        number = self.settings.rollouts.trajectories_per_iteration
+        first = int(self._rng(STARTS, 0).integers(2**30))
+        return [first + (i // 2 if state.iteration == 0 else i) for i in range(number)]
+
+    def show(self, state: LearnerState) -> Entry:
+        """Step 4: the next question, the best candidate against its opponent; `asked`."""
+        number, newcomer = state.queries + 1, state.candidates[0]
+        incumbent = state.opponents[newcomer] if state.opponents else state.preferences.undominated[-1]
+        query = queries.show(number, newcomer, incumbent, state.trajectories, rng=self._rng(SHOW, number))
+        event = {"event": "asked", "query": number, "first": query.first, "second": query.second, "newcomer": newcomer}
+        if self.settings.questions.same_start:
+            event["rivals"] = rivals(query, state.trajectories, state.preferences)
+        return _entry(event)
+
+    def improve(self, state: LearnerState) -> Entry:
+        """Steps 1 and 2, and the value of the new policy, which the learner does not see; `improved`."""
+        options = self.settings.rollouts
+        clock = [time.perf_counter()]
+        utility = self._estimate(state)
+        clock.append(time.perf_counter())
+        check = self._check(state, utility) if self.settings.update.checked else None
+        improved, bound = self.update(state, utility, check)
+        clock.append(time.perf_counter())
+        evaluated = self._evaluated(improved.policy)
+        value = float(evaluated.total.mean())
+        clock.append(time.perf_counter())
+        seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
+        summary = {
+            "iteration": state.iteration + 1,
+            "answers": state.preferences.answers,
+            "value": value if check is None else self._value_of(state, check.best),
+            "value_newest": value,
+            **({} if check is None else {"check": asdict(check)}),
+            "terminated": float(evaluated.terminated.mean()),  # a share of the episodes
+            **utility.quality.summary(),
+            **improved.summary(),
+            "seconds": seconds,
+            "schedule": bound.summary(),
+            "hyperparameters": utility.hyperparameters(),
+        }
+        return _entry(
+            {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
+            trajectories=state.trajectories[-options.trajectories_per_iteration :],
+            policy=improved.policy,
+            estimate=utility,
+        )
+
+    def _evaluated(self, policy: Any) -> rollouts.Returns:
+        """Fresh episodes, the same for all policies of the run; the learner never sees them."""
+        options = self.settings.rollouts
+        return rollouts.returns(
+            self.environment,
+            policy,
+            key=self._key(EVALUATE, 0),
+            episodes=options.evaluation_episodes,
+            max_steps=options.max_steps,
+        )
+
+    def _value_of(self, state: LearnerState, number: int) -> float:
+        """The value of the policy after so many iterations."""
+        if number == 0:  # the first policy
+            value = state.summaries[0]["value"] if state.summaries else self._evaluated(state.policy).total.mean()
+        else:
+            value = state.summaries[number - 1]["value_newest"]
+        return float(value)
+
+    def _check(self, state: LearnerState, utility: UtilityEstimate) -> Check:
+        """Whether the newest policy is better than the best before it, by the trajectories of both."""
+        if state.iteration == 0:
+            return Check(0, 1.0)
+        newest, best = (
+            utility.trajectory_utilities([state.trajectories[i] for i in self._of_iteration(number)])
+            for number in (state.iteration, state.best)
+        )
+        return checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
+
+    def _estimate(self, state: LearnerState) -> UtilityEstimate:
+        """Step 1."""
+        settings = self.settings
+        rng = self._rng(FEATURES, 2 * state.iteration)
+        known = state.preferences
+        # Decision: a person may favour a side. The simulated expert does not, and each unknown costs answers.
+        sides = () if settings.expert == "return" else known.shown_first
+        return estimate(
+            Comparisons.among(
+                state.trajectories,
+                known.pairs,
+                ties=known.ties,
+                shown_first=sides,
+                discount=settings.trajectory_discount,
+            ),
+            self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),
+            settings.estimation,
+            settings.model,
+            seed=int(self._rng(FIT, state.iteration).integers(2**31)),
+        )
+
+    def update(self, state: LearnerState, utility: UtilityEstimate, check: Check | None) -> tuple[Improvement, Bound]:
+        """Step 2: an update is proposed, the schedule decides on its bound, the update is applied."""
+        settings, iteration = self.settings, state.iteration
+        number = settings.rollouts.trajectories_per_iteration
+        taken = recent(state.trajectories, settings.update, an_iteration=number)
+        steps = transitions(taken)
+        rng, key = self._rng(FEATURES, 2 * iteration + 1), self._key(IMPROVE, iteration)
+        state_action_features = self.feature_source.of_steps(steps, settings.features.of_critic, rng=rng)
+        constant = isinstance(self.schedule, schedules.ConstantBound)  # looks at no draws
+        utilities, draws = step_utilities(utility, steps, draws=0 if constant else SCHEDULE_DRAWS)
+        problem = UpdateProblem(
+            steps,
+            utilities,
+            states_of_update(
+                state.trajectories,
+                settings.update,
+                an_iteration=number,
+                rng=self._rng(VISITED, iteration),
+            ),
+            settings.critic,
+            state_action_features,
+            self.feature_source.of_states(state.trajectories, settings.features.of_critic, rng=rng),
+            self.environment.action_space,
+            None if constant else quarters(taken),
+        )
+        stepped_back = check is not None and check.stepped_back
+        policy = state.kept_policy if stepped_back else state.policy
+        proposed = propose(policy, problem, key=key, utility_draws=draws)
+        usual, answers = settings.update.kl_bound, state.preferences.answers
+        bound = schedules.decide(self.schedule, Situation(iteration + 1, answers, usual, utility, proposed))
+        improved = apply_update(
+            proposed,
+            bound.kl_bound * (1.0 if check is None else check.trust),
+            key=key,
+            rng=self._rng(IMPROVE, iteration),
+            updates=settings.update.updates_per_iteration,
+        )
+        return improved, bound
+
+    def _rng(self, purpose: int, count: int) -> np.random.Generator:
+        return np.random.default_rng([self.settings.seed, purpose, count])
+
+    def _key(self, purpose: int, count: int) -> jax.Array:
+        return jax.random.key(int(self._rng(purpose, count).integers(2**31)))
+
+
+def _entry(event: dict[str, Any], **parts: Any) -> Entry:
+    return Entry(events.plain(event), parts)

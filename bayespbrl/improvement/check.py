@@ -1,0 +1,48 @@
+"""Whether an update was a step forward: the newest policy beside the best one, by the utility of their trajectories.
+
+An update follows an estimate of Q. The trajectories after it show what it did, and the posterior, not the hidden
+reward, says whether that is better. After a step back the run goes on from the best policy, with smaller updates.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+LEAST_TRUST = 0.05
+STANDARD_ERRORS = 1.0  # by which the newest policy has to be worse for a step back
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result for one iteration.
+
+    Attributes:
+      best: number of the iteration whose trajectories followed the best policy so far, from 0.
+      trust: share of the KL bound that the next update may use.
+      stepped_back: whether the run goes on from the best policy rather than from the newest.
+      gain, standard_error: mean difference of the utilities of the trajectories, newest minus best, and its error.
+    """
+
+    best: int
+    trust: float
+    stepped_back: bool = False
+    gain: float = 0.0
+    standard_error: float = 0.0
+
+
+def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, trust: float) -> Check:
+    """The check of one update.
+
+    Args:
+      differences: utility of each of the newest policy's trajectories minus that of the best one's, pair by pair from
+        the same start where there is one.
+      newest, best: numbers of the iterations of both.
+      trust: so far; it is doubled, up to 1, after a step forward and halved after a step back.
+    """
+    gain, error = float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(len(differences)))
+    if gain > 0:
+        return Check(newest, min(1.0, 2 * trust), False, gain, error)
+    if gain < -STANDARD_ERRORS * error:
+        return Check(best, max(LEAST_TRUST, trust / 2), True, gain, error)
+    return Check(best, trust, False, gain, error)

@@ -1,0 +1,30 @@
+"""The check of an update: the newest policy beside the best by the utility of their trajectories."""
+
+import numpy as np
+import pytest
+
+from bayespbrl.improvement.check import LEAST_TRUST, Check, checked
+
+NOISE = np.array([-1.0, 1.0, -0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("gain", "trust", "expected"),
+    [
+        (0.2, 0.5, (7, 1.0, False)),  # a step forward
+        (0.2, 0.05, (7, 0.1, False)),
+        (-0.2, 0.5, (3, 0.5, False)),  # within the error: it goes on, and the best stays
+        (0.0, 0.5, (3, 0.5, False)),
+        (-2.0, 0.5, (3, 0.25, True)),  # a step back
+        (-2.0, 0.06, (3, LEAST_TRUST, True)),
+    ],
+)
+def test_a_step_forward_is_kept_and_a_step_back_is_taken_back(gain, trust, expected):
+    check = checked(NOISE + gain, newest=7, best=3, trust=trust)
+    assert (check.best, check.trust, check.stepped_back) == expected
+    assert check.gain == pytest.approx(gain)
+    assert check.standard_error == pytest.approx(np.std(NOISE, ddof=1) / 2)
+
+
+def test_equal_trajectories_change_nothing():
+    assert checked(np.zeros(4), newest=7, best=3, trust=0.5) == Check(3, 0.5)

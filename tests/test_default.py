@@ -1,0 +1,129 @@
+"""The default: a budget of answers, checked updates and the kept policy; questions from one start."""
+
+from itertools import pairwise
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from toys import Slope, fingerprint
+
+import bayespbrl
+from bayespbrl import Learner, ReturnExpert, rollouts
+from bayespbrl.rollouts import rollout
+
+FAST = {"max_steps": 8, "evaluation_episodes": 4, "centres": 20, "seed": 3, "hyperparameters": "given"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run of the default on a task without a preset, comparing by start."""
+    directory = tmp_path_factory.mktemp("runs") / "slope"
+    env = gymnasium.wrappers.TimeLimit(Slope(), 8)
+    bayespbrl.start(env, directory, answers=4, same_start=True, **FAST).run(ReturnExpert())
+    return bayespbrl.load(directory, env=env)
+
+
+def test_the_budget_ends_the_questions_and_the_run_a_little_later(run):
+    assert run.preferences.answers == 4
+    answers = [summary["answers"] for summary in run.iterations]
+    assert answers[-6:] == [4] * 6 or len(answers) == run.settings.most_iterations
+    assert run.learner.finished
+    assert run.settings.iterations is None
+
+
+def test_the_two_of_a_question_start_alike(run):
+    log = [line for line in (run.path / "events.jsonl").read_text().splitlines() if '"asked"' in line]
+    assert len(log) == 4
+    for i, j in (*run.preferences.pairs, *run.preferences.ties):
+        np.testing.assert_array_equal(run.trajectories[i].states[0], run.trajectories[j].states[0])
+    starts = [trajectory.states[0].tobytes() for trajectory in run.trajectories]
+    assert starts[0] == starts[1] != starts[2]  # two of each at first
+    assert starts[10:20] == starts[20:30]
+    assert len(set(starts[10:20])) == 10
+    assert run.learner.comparable_starts
+
+
+def test_the_kept_policy_is_the_best_that_was_tried_and_its_value_is_reported(run):
+    values = [summary["value_newest"] for summary in run.iterations]
+    best = [summary["check"]["best"] for summary in run.iterations]
+    assert best[0] == 0
+    assert all(before <= after <= number for number, (before, after) in enumerate(pairwise(best), 1))
+    for summary, number in zip(run.iterations, best, strict=True):
+        assert summary["value"] == (run.iterations[0]["value"] if number == 0 else values[number - 1])
+    assert run.evaluate(episodes=300, seed=1) == pytest.approx(run.iterations[-1]["value"], abs=6.0)
+    assert run.learner.last_policy is run.learner.state.policy
+
+
+def test_a_step_back_goes_on_from_the_kept_policy_with_less_trust():
+    """An estimate that calls the newest trajectories worse sends the next update back to the best policy."""
+    learner = Learner(Slope(), answers=3, **FAST)
+    learner.run(lambda first, second: "first" if first.total_reward > second.total_reward else "second")
+    backwards = [s for s in learner.iterations if s["check"]["stepped_back"]]
+    for summary in learner.iterations:
+        check = summary["check"]
+        assert check["stepped_back"] == (check["gain"] < -check["standard_error"])
+        assert summary["kl_bound"] <= check["trust"] * 1.0 + 1e-12
+    assert all(summary["check"]["trust"] < 1 for summary in backwards)
+
+
+class Unseeded(Slope):
+    """Starts anew each time, whatever the seed."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=None, options=options)
+
+
+def test_an_environment_that_no_seed_resets_is_compared_across_starts():
+    learner = Learner(Unseeded(), answers=3, same_start=True, **FAST).run(ReturnExpert())
+    assert learner.comparable_starts is False
+    assert learner.preferences.answers == 3
+    assert Learner(Unseeded(), answers=3, **FAST).comparable_starts is None  # not asked for
+
+
+def test_a_stopped_run_of_the_default_goes_on_bit_for_bit(tmp_path):
+    options = {"answers": 3, "same_start": True, **FAST, "hyperparameters": "inferred"}
+    whole = Learner("swing-up", **options).run(ReturnExpert())
+    stopped, expert = bayespbrl.start("swing-up", tmp_path / "run", **options), ReturnExpert()
+    for _ in range(2):
+        stopped.tell([expert(*query.trajectories) for query in stopped.ask()])
+    again = bayespbrl.resume(tmp_path / "run").run(expert)
+    assert fingerprint(again) == fingerprint(whole)
+    assert again.worth_asking == whole.worth_asking
+    assert again.state.trust == whole.state.trust
+
+
+@pytest.mark.parametrize("env", ["swing-up", "Pendulum-v1", "CartPole-v1", "acrobot"])
+def test_equal_starts_give_equal_first_states_and_other_actions(env):
+    environment = rollouts.open_environment(env)
+    policy = Learner(env, seed=1).policy
+    first, second = (
+        rollout(environment, policy, key=jax.random.key(key), episodes=3, max_steps=5, starts=[7, 7, 8])
+        for key in (1, 2)
+    )
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.states[0], other.states[0])
+    assert any(not np.array_equal(a.actions, b.actions) for a, b in zip(first, second, strict=True))
+    np.testing.assert_array_equal(first[0].states[0], first[1].states[0])
+    if env not in ("swing-up", "acrobot"):  # which always start alike
+        assert not np.array_equal(first[0].states[0], first[2].states[0])
+    with pytest.raises(ValueError, match="starts: expected 3, one for each episode, got 2"):
+        rollout(environment, policy, key=jax.random.key(1), episodes=3, max_steps=5, starts=[7, 7])
+
+
+def test_a_budget_of_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"^answers: expected .*, got 0$"):
+        Learner("CartPole-v1", answers=0)
+
+
+def test_a_person_who_favours_a_side_is_found_out(tmp_path):
+    """Answers by the side alone, in a run whose expert is no simulation: the side bias is inferred, and reported."""
+    options = {"preset": "paper", "iterations": 9, "max_steps": 20, "evaluation_episodes": 2, "seed": 5}
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="other", **options)
+    learner.run(lambda first, second: "first")
+    figures = learner.estimate.hyperparameters()
+    assert figures["side_bias lower"] > 0
+    assert figures["side_bias"] == pytest.approx(float(learner.estimate.posterior["posterior"]["side_bias"].mean()))
+    assert "side bias" in bayespbrl.load(tmp_path / "run").report("md").read_text()
+    honest = Learner("gridworld", **(options | {"iterations": 1})).run(ReturnExpert())
+    assert "side_bias" not in honest.estimate.hyperparameters()  # the simulated expert looks at the return alone
