@@ -1,7 +1,7 @@
 """Seconds of a trial by step of the cycle, and its peak memory.
 
     python benchmarks/cycle.py [gridworld|bicycle|swing-up|acrobot|<gymnasium id>]
-        [--iterations N] [--seed S] [--utility NAME] [--policy KIND] [--centres N]
+        [--answers N] [--iterations N] [--preset NAME] [--seed S] [--utility NAME] [--policy KIND] [--centres N]
 
 One trial with the simulated expert and the preset of the domain. Prints a table and one JSON line. The functions of the
 steps are replaced by timed ones wherever they are bound. Each second counts once, for the innermost step. A second in
@@ -150,7 +150,7 @@ def measure(environment: str, **settings: Any) -> dict[str, Any]:
         "environment": environment,
         "utility": learner.settings.estimation.utility,
         "seed": learner.settings.seed,
-        "iterations": learner.settings.iterations,
+        "iterations": len(learner.iterations),
         "answers": learner.preferences.answers,
         "transitions": sum(len(trajectory) for trajectory in learner.trajectories),
         "value": learner.iterations[-1]["value"],
@@ -177,6 +177,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("environment", nargs="?", default="swing-up")
     parser.add_argument("--iterations", type=int)
+    parser.add_argument("--answers", type=int)
+    parser.add_argument("--preset")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--utility")
     parser.add_argument("--policy")

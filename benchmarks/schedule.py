@@ -55,7 +55,7 @@ def measure(environment: str, **settings: Any) -> dict[str, Any]:
         "benchmark": "schedule",
         "environment": environment,
         "hyperparameters": learner.settings.estimation.hyperparameters,
-        "iterations": learner.settings.iterations,
+        "iterations": len(learner.iterations),
         "seconds_without": round(whole, 2),
         "updates_with": round(updates["with"], 2),
         "updates_without": round(updates["without"], 2),
