@@ -84,7 +84,7 @@ class Cycle:
             return queries.Chosen()
         incumbent = state.preferences.undominated[-1]
         situation = QuerySituation(new, known, state.shown, incumbent, state.estimate, signal, rng, opponents)
-        return queries.later_questions(self.query_rule, situation, options)
+        return queries.later_questions(self.query_rule, situation, options, answers=state.preferences.answers)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""

@@ -69,15 +69,15 @@ class Questions:
 
         Decision: at most half the answers so far. Draws from two or three answers agree even where they are wrong.
         """
-        if self.spent(preferences):
+        if self.within_budget(1, preferences.answers) == 0:
             return True
         if unasked >= min(self.unasked_iterations, preferences.answers // 2) or not preferences.pairs:
             return False
         return signal is None or (estimate.quality.converged and signal >= UNASKED_SIGNAL)
 
-    def spent(self, preferences: Preferences) -> bool:
-        """Whether the budget of answers is used up."""
-        return self.answers is not None and preferences.answers >= self.answers
+    def within_budget(self, wanted: int, answers: int) -> int:
+        """As many of `wanted` answers as the budget has left after so many."""
+        return wanted if self.answers is None else max(0, min(wanted, self.answers - answers))
 
 
 @dataclass(frozen=True)
@@ -225,21 +225,22 @@ def first_questions(
     new: Sequence[int], opponents: Mapping[int, int], options: Questions, *, rng: np.random.Generator
 ) -> Chosen:
     """Random ones, before there is an estimate to choose by (paper, step 4); with opponents, each pair once."""
-    wanted = options.first_queries if options.answers is None else min(options.first_queries, options.answers)
+    wanted = options.within_budget(options.first_queries, 0)
     pairs = [number for number in new if opponents.get(number, number) < number]
     candidates = random_candidates(pairs or new, rng=rng)
     return Chosen(wanted, candidates, tuple(opponents[n] for n in candidates) if pairs else None)
 
 
-def later_questions(rule: QueryRule, situation: QuerySituation, options: Questions) -> Chosen:
-    """Those of `rule`; none where the best is not worth asking."""
+def later_questions(rule: QueryRule, situation: QuerySituation, options: Questions, *, answers: int) -> Chosen:
+    """Those of `rule`, after so many answers; none where the best is not worth asking."""
     order, opponents, information = candidates(rule, situation), None, None
     if options.same_start:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)
     if options.worthwhile and situation.estimate.posterior is not None:
         information = float(replace(situation, new=order[:1]).information()[0])
     worth = information is None or information >= LEAST_INFORMATION
-    return Chosen(options.queries_per_iteration if worth else 0, order, opponents, information)
+    wanted = options.within_budget(options.queries_per_iteration, answers) if worth else 0
+    return Chosen(wanted, order, opponents, information)
 
 
 def _ordered(

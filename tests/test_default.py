@@ -81,6 +81,7 @@ def test_an_environment_that_no_seed_resets_is_compared_across_starts():
     assert Learner(Unseeded(), answers=3, **FAST).comparable_starts is None  # not asked for
 
 
+@pytest.mark.slow
 def test_a_stopped_run_of_the_default_goes_on_bit_for_bit(tmp_path):
     options = {"answers": 3, "same_start": True, **FAST, "hyperparameters": "inferred"}
     whole = Learner("swing-up", **options).run(ReturnExpert())
@@ -116,6 +117,7 @@ def test_a_budget_of_nothing_is_refused():
         Learner("CartPole-v1", answers=0)
 
 
+@pytest.mark.slow
 def test_a_person_who_favours_a_side_is_found_out(tmp_path):
     """Answers by the side alone, in a run whose expert is no simulation: the side bias is inferred, and reported."""
     options = {"preset": "paper", "iterations": 9, "max_steps": 20, "evaluation_episodes": 2, "seed": 5}

@@ -275,7 +275,7 @@ def test_a_question_is_left_out_whose_answer_would_tell_nothing():
     def chosen(draws, **options):
         given = situation(draws, ZERO)
         given.estimate.posterior = "drawn"
-        return later_questions(QUERY_RULES["information"], given, Questions(**options))
+        return later_questions(QUERY_RULES["information"], given, Questions(**options), answers=4)
 
     foreseeable = np.full((4, 3), 9.0)
     assert chosen(foreseeable).wanted == 1
@@ -291,6 +291,10 @@ def test_nothing_is_asked_once_the_budget_is_spent():
     options = Questions(answers=3)
     assert not options.skips(Preferences(((0, 1),), (0,), 2), 0, estimate, 0.9)
     assert options.skips(Preferences(((0, 1),), (0,), 3), 0, estimate, 0.9)
+    several = Questions(answers=3, queries_per_iteration=4)
+    assert [several.within_budget(4, answers) for answers in (0, 1, 2, 3, 9)] == [3, 2, 1, 0, 0]
+    given = situation(DRAWS, ZERO)
+    assert later_questions(QUERY_RULES["information"], given, several, answers=1).wanted == 2
 
 
 def test_three_lines_make_a_rule_of_ones_own():

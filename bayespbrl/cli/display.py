@@ -63,7 +63,8 @@ def _run_with_bar(learner: Learner) -> None:
             simulated_expert(learner.settings.wrong_answers, seed=learner.settings.seed),
             progress=lambda now: bar.update(task, completed=now.state.iteration, state=_state(now)),
         )
-        bar.update(task, completed=learner.state.iteration, state=_state(learner))
+        ended = learner.state.iteration  # before the limit, where the answers are used up
+        bar.update(task, total=ended, completed=ended, state=_state(learner))
 
 
 def progress_bar() -> Progress:
