@@ -7,7 +7,7 @@ from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.features import OneHot, RadialBasisOptions, StateActionProduct, draw_state_action_features
 from bayespbrl.improvement import q_function, update
-from bayespbrl.improvement.problem import UpdateProblem
+from bayespbrl.improvement.problem import PolicyUpdate, UpdateProblem, recent
 from bayespbrl.improvement.q_function import Critic
 from bayespbrl.policies import (
     GaussianProcessPolicy,
@@ -377,3 +377,18 @@ def test_a_policy_that_follows_the_weights_takes_one_update_whatever_is_allowed(
 def test_continuous_actions_are_kept_within_the_bounds_and_discrete_ones_as_they_are():
     np.testing.assert_array_equal(clipped(np.array([[-5.0], [0.3], [5.0]]), FORCES), [[-2], [0.3], [1]])
     np.testing.assert_array_equal(clipped(np.array([0, 2]), Discrete(3)), [0, 2])
+
+
+def test_the_critic_takes_the_last_iterations_but_neither_too_few_nor_too_many_transitions():
+    def taken(lengths, iterations):
+        trajectories = [Trajectory(np.zeros((n + 1, 1)), np.zeros((n, 1)), np.zeros(n)) for n in lengths]
+        chosen = recent(trajectories, PolicyUpdate(critic_iterations=iterations), an_iteration=2)
+        assert list(chosen) == trajectories[len(trajectories) - len(chosen) :]
+        return len(chosen)
+
+    assert taken([900] * 20, None) == 20
+    assert taken([900] * 20, 4) == 8
+    assert taken([10] * 20, 4) == 20  # 5000 are not there yet
+    assert taken([100] * 200, 4) == 50
+    assert taken([3000] * 20, 4) == 3  # 10 000 at most
+    assert taken([20_000] * 20, 4) == 1

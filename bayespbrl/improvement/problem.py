@@ -15,7 +15,9 @@ from bayespbrl.improvement.q_function import Critic
 from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.estimate import UtilityEstimate
 
-LEAST_TRANSITIONS = 5000  # that LSTD takes, where there are as many: some ten for each of its features
+# How many transitions LSTD takes of the last iterations, where there are as many: some ten for each of its features, and
+# no more than a person would wait for.
+LEAST_TRANSITIONS, MOST_TRANSITIONS = 5_000, 10_000
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,8 @@ class PolicyUpdate:
         most of the bound. Each has the Q of the policy before it; all but the first hold a continuous policy's spread.
         The paper's is 1.
       recent_iterations: the update takes the states of so many last iterations; None for those of all.
-      critic_iterations: LSTD takes the transitions of so many last iterations, but at least `LEAST_TRANSITIONS`; None
-        for those of all, as in the paper. Old ones say little of the current policy.
+      critic_iterations: LSTD takes the transitions of so many last iterations, but at least `LEAST_TRANSITIONS` and at
+        most `MOST_TRANSITIONS`; None for those of all, as in the paper. Old ones say little of the current policy.
       checked: whether each update is checked by the trajectories that follow it: the run keeps the policy that the
         posterior thinks best, and goes on from there after a step back. The paper's learner never looks back.
       update_states: most of these states that the update takes, drawn at random, where they are continuous: it bounds
@@ -121,8 +123,9 @@ def recent(trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iter
     if options.critic_iterations is None:
         return trajectories
     lengths = np.cumsum([len(trajectory) for trajectory in reversed(trajectories)])
-    enough = 1 + int(np.searchsorted(lengths, LEAST_TRANSITIONS))
-    return trajectories[-max(enough, options.critic_iterations * an_iteration) :]
+    least = 1 + int(np.searchsorted(lengths, LEAST_TRANSITIONS))
+    most = max(1, int(np.searchsorted(lengths, MOST_TRANSITIONS, side="right")))
+    return trajectories[-max(least, min(most, options.critic_iterations * an_iteration)) :]
 
 
 def quarters(trajectories: Sequence[Trajectory]) -> Int[np.ndarray, " n"]:

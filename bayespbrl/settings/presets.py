@@ -105,6 +105,7 @@ DEFAULT: dict[str, Any] = {
     "checked": True,
     "critic_iterations": 4,  # on the hidden reward Pendulum forgets with all transitions
     "recent_iterations": 4,
+    "update_states": 10_000,
     "fixed_point_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
     "projection_ridge": 1e-5,
 }
