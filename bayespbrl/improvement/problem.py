@@ -15,8 +15,8 @@ from bayespbrl.improvement.q_function import Critic
 from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.estimate import UtilityEstimate
 
-# How many transitions LSTD takes of the last iterations, where there are as many: some ten for each of its features, and
-# no more than a person would wait for.
+# How many transitions of the last iterations LSTD takes, where there are as many: some ten for each of its features,
+# and no more than a person would wait for.
 LEAST_TRANSITIONS, MOST_TRANSITIONS = 5_000, 10_000
 
 
