@@ -63,7 +63,7 @@ class RunContents:
     @property
     def finished(self) -> bool:
         """Whether all iterations are completed."""
-        answers = [summary["answers"] for summary in self.iterations]
+        answers = [summary.get("answers", 0) for summary in self.iterations]  # none in a damaged summary
         unasked = next((n for n, before in enumerate(reversed(answers[:-1])) if before != answers[-1]), 0)
         return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked)
 
