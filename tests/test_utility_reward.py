@@ -76,7 +76,12 @@ def test_other_spaces_and_runs_without_an_estimate_are_refused(pendulum, tmp_pat
         UtilityReward(gymnasium.make("Pendulum-v1"), program, caution=1.0)
 
 
-@pytest.mark.parametrize("task", ["pendulum", "cartpole"])
+@pytest.fixture(scope="module")
+def linear(tmp_path_factory):
+    return run_of("Pendulum-v1", tmp_path_factory.mktemp("runs") / "linear", policy="linear-gaussian")
+
+
+@pytest.mark.parametrize("task", ["pendulum", "cartpole", "linear"])
 def test_predict_takes_one_observation_or_many(request, task):
     run = request.getfixturevalue(task)
     env = gymnasium.make(run.settings.env)

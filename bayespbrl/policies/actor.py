@@ -71,8 +71,7 @@ class Actor:
         rows = np.asarray(self.observe(observation))[None]
         if is_discrete(self.policy):
             return int(self.enact(int(np.argmax(self.policy.probabilities(rows)[0]))))  # type: ignore[attr-defined]
-        mean = self.policy.mean_and_variance(rows.astype(float))[0][0]  # type: ignore[attr-defined]
-        return self._within(mean)
+        return self._within(self.policy.mean_actions(rows.astype(float))[0])  # type: ignore[attr-defined]
 
     def _within(self, action: np.ndarray) -> Any:
         space = self.action_space

@@ -144,6 +144,10 @@ class GaussianProcessPolicy:
         variance = np.asarray(self.signal_variance) * left + np.asarray(self.noise_variance)
         return np.asarray(self.action_centre) + np.stack(means, axis=1), variance
 
+    def mean_actions(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
+        """Mean action at each of N observations, not clipped."""
+        return self.mean_and_variance(observations)[0]
+
     def action_standard_deviation(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
         """Standard deviation of the action at each of N observations, in the action's units."""
         return np.sqrt(self.mean_and_variance(observations)[1])
