@@ -19,6 +19,7 @@ import numpy as np
 
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
+from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
 
@@ -92,6 +93,10 @@ class LearnerState:
     shown: frozenset[int] = frozenset()
     summaries: tuple[Mapping[str, Any], ...] = ()
     previous: "LearnerState | None" = field(default=None, repr=False)
+
+    def finished(self, settings: Settings) -> bool:
+        """Whether a run with these settings ends here: after an iteration, not within one."""
+        return not self.collected and settings.finished(self.iteration, self.preferences.answers, self.unasked)
 
     @property
     def kept_policy(self) -> Any:

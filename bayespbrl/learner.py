@@ -97,8 +97,7 @@ class Learner:
     @property
     def finished(self) -> bool:
         """Whether all iterations are completed, or the budget of answers has done what it can."""
-        state = self.state
-        return not state.collected and self.settings.finished(state.iteration, state.preferences.answers, state.unasked)
+        return self.state.finished(self.settings)
 
     @property
     def policy(self) -> Any:

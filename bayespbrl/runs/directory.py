@@ -194,8 +194,7 @@ class RunDirectory:
             "env": self.settings.env,
             "utility": self.settings.estimation.utility,
             "seed": self.settings.seed,
-            "finished": not state.collected
-            and self.settings.finished(state.iteration, state.preferences.answers, state.unasked),
+            "finished": state.finished(self.settings),
             "answers": state.preferences.answers,
             "iterations": list(state.summaries),
         }

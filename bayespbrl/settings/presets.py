@@ -14,6 +14,7 @@ from gymnasium.spaces import Box
 from bayespbrl import checks
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR
 
+NAMES = ("default", "paper")
 # The paper's protocol, and the control: a constant bound, one update and one question an iteration.
 PAPER: dict[str, dict[str, Any]] = {
     "gridworld": {
@@ -154,7 +155,7 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
       ValueError: an unknown preset.
     """
     name = IDS.get(env, env)
-    if checks.one_of("preset", chosen.get("preset", "default"), ("default", "paper")) == "paper":
+    if checks.one_of("preset", chosen.get("preset", "default"), NAMES) == "paper":
         return {"hyperparameters": "given"} | PAPER.get(name, {})
     options = DEFAULT | ({} if task is None else task.derived()) | TASKS.get(name, {})
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":

@@ -14,6 +14,7 @@ from bayespbrl.improvement.problem import PolicyUpdate
 from bayespbrl.improvement.q_function import Critic
 from bayespbrl.models import PreferenceModel
 from bayespbrl.queries import Questions
+from bayespbrl.settings import presets
 from bayespbrl.settings.presets import Task, preset_options
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 
@@ -125,7 +126,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         checks.whole("seed", self.seed, 0)
-        checks.one_of("preset", self.preset, ("default", "paper"))
+        checks.one_of("preset", self.preset, presets.NAMES)
         if self.iterations is not None:
             checks.whole("iterations", self.iterations)
         elif self.questions.answers is None:
