@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from gymnasium.spaces import Discrete
-from toys import Slope, fingerprint
+from toys import QUICK, Slope, fingerprint
 
 from bayespbrl import Answer, Learner, ReturnExpert, load, queries, resume, rollouts, start
 from bayespbrl import cycle as cycle_module
@@ -20,15 +20,6 @@ from bayespbrl.improvement.update import NEARLY
 from bayespbrl.models import restored, stored
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
-
-QUICK = {
-    "preset": "paper",
-    "utility": "linear-program",
-    "iterations": 3,
-    "max_steps": 20,
-    "evaluation_episodes": 3,
-    "seed": 7,
-}
 
 
 class Memory:
@@ -569,6 +560,9 @@ def compilations_after(run, iteration):
     return len(count)
 
 
+SHORT = {"preset": "paper", "iterations": 3, "max_steps": 12, "centres": 20, "evaluation_episodes": 2}
+
+
 def seen_problems(monkeypatch):
     """The problem of each update from now on."""
     seen, real = [], cycle_module.propose
@@ -594,14 +588,7 @@ def test_answers_have_a_discount_of_their_own(monkeypatch):
 @pytest.mark.slow
 def test_the_policy_update_takes_the_states_that_the_settings_allow(monkeypatch):
     problems = seen_problems(monkeypatch)
-    options = {
-        "preset": "paper",
-        "iterations": 3,
-        "max_steps": 12,
-        "centres": 20,
-        "evaluation_episodes": 2,
-        "utility": "linear-program",
-    }
+    options = SHORT | {"utility": "linear-program"}
     run = Learner("swing-up", seed=3, update_states=150, recent_iterations=2, **options).run(ReturnExpert())
     acted = [{tuple(state) for state in trajectory.states[:-1]} for trajectory in run.trajectories]
     seen = [problem.states for problem in problems]
@@ -624,14 +611,7 @@ def test_the_bound_of_an_iteration_is_decided_once_and_followed_by_several_updat
         asked.append((situation.iteration, situation.update.q_draws.shape[1]))
         return 0.2
 
-    options = {
-        "preset": "paper",
-        "iterations": 3,
-        "max_steps": 12,
-        "centres": 20,
-        "evaluation_episodes": 2,
-        "hyperparameters": "given",
-    }
+    options = SHORT | {"hyperparameters": "given"}
     once, often, again = (
         Learner("swing-up", seed=3, schedule=cautious, updates_per_iteration=number, **options).run(ReturnExpert())
         for number in (1, 3, 3)

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from toys import fingerprint
+from toys import QUICK, fingerprint
 
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert
@@ -27,14 +27,6 @@ from bayespbrl.runs import run as runs
 from bayespbrl.runs.directory import PartialLine, RunDirectory, read_log_lines
 from bayespbrl.settings.presets import PAPER
 
-QUICK = {
-    "preset": "paper",
-    "utility": "linear-program",
-    "iterations": 3,
-    "max_steps": 20,
-    "evaluation_episodes": 3,
-    "seed": 7,
-}
 FILES = {"settings.json", "events.jsonl", "summary.json", "iterations"}
 
 

@@ -1,9 +1,19 @@
-"""A toy environment that can go wrong, and the comparison of two learners bit for bit."""
+"""A toy environment that can go wrong, a run that takes a second, and the comparison of two learners bit for bit."""
 
 import gymnasium
 import jax
 import numpy as np
 from gymnasium.spaces import Box
+
+# A run of the paper's protocol that takes a second.
+QUICK = {
+    "preset": "paper",
+    "utility": "linear-program",
+    "iterations": 3,
+    "max_steps": 20,
+    "evaluation_episodes": 3,
+    "seed": 7,
+}
 
 
 class Slope(gymnasium.Env):
