@@ -241,7 +241,7 @@ def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
         "utility": "posterior-mean",
         "schedule": "confidence",
         "unasked_iterations": 2,
-        "iterations": 12,
+        "iterations": 9,
     }
     run = learner(**options).run(ReturnExpert())
     unasked = 0
@@ -251,7 +251,7 @@ def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
         unasked = unasked + 1 if sure else 0
         assert summary["answers"] == last["answers"] + (not sure)
     answers = run.iterations[-1]["answers"]
-    assert answers == {0.0: 6, 1.1: 13}.get(threshold, answers)
+    assert answers == {0.0: 5, 1.1: 10}.get(threshold, answers)
 
 
 def test_asking_again_changes_nothing():
@@ -632,15 +632,14 @@ def test_compilations_do_not_grow_with_the_iterations():
 
 @pytest.mark.slow
 def test_compilations_of_the_sampler_grow_with_its_capacity_only():
-    # 9 answers an iteration: the fourth takes them beyond 32, the first capacity
+    # 11 answers an iteration: the third takes them beyond 32, the first capacity
     jax.clear_caches()  # or what other tests compiled would not be counted here
-    many = {"utility": "posterior-mean", "iterations": 5, "first_queries": 9, "queries_per_iteration": 9}
-    run = learner(**many)
-    assert 0 < compilations_after(run, 3) <= 9  # eight for the chains, one for the evidence
+    many = {"trajectories_per_iteration": 12, "first_queries": 11, "queries_per_iteration": 11}
+    run = learner(utility="posterior-mean", iterations=3, **many)
+    assert 0 < compilations_after(run, 2) <= 9  # eight for the chains, one for the evidence
     assert len(run.preferences.pairs) > 32
-    assert compilations_after(learner(**many), 0) == 0
-    assert compilations_after(learner(utility="posterior-mean", iterations=8), 3) <= 9
-    assert compilations_after(learner(utility="posterior-mean", iterations=8), 0) == 0
+    few = learner(utility="posterior-mean", iterations=4, trajectories_per_iteration=12)
+    assert compilations_after(few, 0) == 0
 
 
 @pytest.mark.slow
@@ -655,7 +654,7 @@ def test_a_continued_run_draws_the_same_posterior():
 
 @pytest.mark.slow
 def test_the_gridworld_is_learned_from_preferences():
-    run = Learner("gridworld", preset="paper", iterations=12, seed=1000, evaluation_episodes=50).run(ReturnExpert())
+    run = Learner("gridworld", preset="paper", iterations=7, seed=1000, evaluation_episodes=50).run(ReturnExpert())
     assert run.iterations[-1]["value"] > 3 * 44.34  # of the uniform policy
     assert all(summary["rhat_max"] < 1.01 for summary in run.iterations if summary["utility_converged"])
 
