@@ -5,7 +5,7 @@ dataclass of arrays and numbers, so that a run can store what it used. A user's 
 observations; `checked_features` calls it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, Shaped
 from numpy.typing import ArrayLike
 
 from bayespbrl.checks import indices, matrix, positive, whole
-from bayespbrl.kernels import as_periods, median_bandwidths, radial_basis
+from bayespbrl.kernels import as_periods, median_bandwidths, radial_basis, radial_basis_under
 from bayespbrl.trajectories import Trajectory, Transitions
 
 StateFeatures = Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
@@ -63,6 +63,15 @@ class RadialBasis:
     def rescaled(self, multiples: ArrayLike) -> Self:
         """The same centres with bandwidths `multiples` times as wide, one number or one a dimension."""
         return replace(self, bandwidths=self.bandwidths * np.asarray(multiples))
+
+    def under(
+        self, multiples: Float[np.ndarray, "c s"], observations: ArrayLike
+    ) -> Iterator[tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]]:
+        """`rescaled(row)(observations)` for each row of `multiples` in turn, as of `radial_basis_under`."""
+        points = matrix("observations", observations, columns=self.centres.shape[1])
+        return radial_basis_under(
+            multiples, points, self.centres, self.bandwidths, self.period, normalised=self.normalised
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,6 +261,17 @@ def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."
         row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         raise ValueError(f"features {name}: expected finite numbers, got NaN or infinity for state {states[row]}")
     return values
+
+
+def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "n ..."]:
+    """wᵀφ of each row of φ, (n, D), for weights (D,), or several side by side, (D, m).
+
+    Raises:
+      ValueError: features of another length than the weights, as a function of the user's may return.
+    """
+    if features.shape[1] != len(weights):
+        raise ValueError(f"features: expected {len(weights)} of each state, as before, got {features.shape[1]}")
+    return np.asarray(features @ weights)
 
 
 def _box(name: str, space: Space[Any]) -> Box:

@@ -6,6 +6,8 @@ dimension of bandwidth zero is left out. Coordinates in which the chord is an or
 kernel matrix into one matrix product.
 """
 
+from collections.abc import Iterator
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,6 +18,7 @@ from bayespbrl import checks
 
 Vector = Float[Array, " s"] | Float[np.ndarray, " s"]
 Rows = Float[Array, "d s"] | Float[np.ndarray, "d s"]
+SMALLEST_SUM = 1e-200  # of a row of products of exponentials: below it they have lost digits
 ROWS_AT_A_TIME = 1024  # keeps a block of a wide kernel matrix in the processor's cache between its three passes
 
 
@@ -78,6 +81,60 @@ def radial_basis(
     return squared_exponential(
         coordinates(points, period) * scale, coordinates(centres, period) * scale, normalised=normalised
     )
+
+
+def radial_basis_under(
+    multiples: Float[np.ndarray, "c s"],
+    points: Float[np.ndarray, "n s"],
+    centres: Float[np.ndarray, "d s"],
+    bandwidths: Float[np.ndarray, " s"],
+    period: Float[np.ndarray, " s"],
+    *,
+    normalised: bool = False,
+) -> Iterator[tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]]:
+    """k under each row of multiples of the bandwidths in turn, and by what its rows are to be multiplied.
+
+    Both together are `radial_basis`; they are only good until the next. k is a product over dimensions, so that the
+    exponentials are taken once for each multiple and dimension; rows in lexicographic order share what they begin with.
+    """
+    squares = _squares(points, centres, bandwidths, period)
+    factors = [
+        {multiple: np.exp(square / (-2 * multiple**2)) for multiple in np.unique(column)}
+        for square, column in zip(squares, multiples.T, strict=True)
+    ]
+    products, ones = [np.empty_like(square) for square in squares], np.ones(len(points))
+    last = np.zeros(len(squares))
+    for row in multiples:
+        for j in range(int(np.argmax(row != last)), len(row)):  # the products of what comes before are at hand
+            if j == 0:
+                products[0] = factors[0][row[0]]
+            else:
+                np.multiply(products[j - 1], factors[j][row[j]], out=products[j])
+        kernel, last = products[-1], row
+        if not normalised:
+            yield kernel, ones
+            continue
+        totals = kernel @ np.ones(len(centres))
+        if (far := totals < SMALLEST_SUM).any():
+            kernel[far] = radial_basis(points[far], centres, bandwidths * row, period, normalised=True)
+            totals[far] = 1.0
+        yield kernel, 1 / totals
+
+
+def _squares(
+    points: Float[np.ndarray, "n s"],
+    centres: Float[np.ndarray, "d s"],
+    bandwidths: Float[np.ndarray, " s"],
+    period: Float[np.ndarray, " s"],
+) -> list[Float[np.ndarray, "n d"]]:
+    """δⱼ²/bⱼ² of each dimension j."""
+    scale, periodic = inverse_bandwidths(bandwidths, period), np.isfinite(period)
+    left, right = coordinates(points, period) * scale, coordinates(centres, period) * scale
+    dimensions = np.concatenate([np.flatnonzero(~periodic), np.flatnonzero(periodic), np.flatnonzero(periodic)])
+    return [
+        sum(np.square(left[:, e, None] - right[:, e]) for e in np.flatnonzero(dimensions == j))
+        for j in range(len(period))
+    ]
 
 
 def radial_basis_row(point: Vector, centres: Rows, bandwidths: Vector, period: Vector) -> Float[Array, " d"]:

@@ -19,6 +19,8 @@ from bayespbrl.features import (
     draw_state_features,
 )
 from bayespbrl.kernels import median_bandwidths, radial_basis_row
+from bayespbrl.trajectories import Trajectory, trajectory_features
+from bayespbrl.utility.length_scales import settings, sums_under, values_under
 
 PERIOD = (2 * np.pi, np.inf)
 STATES = Box(-np.inf, np.inf, (2,))
@@ -257,3 +259,25 @@ def test_good_user_features_pass_as_float64():
 def test_bad_input_is_named(call, message):
     with pytest.raises(ValueError, match=message):
         call(np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+@pytest.mark.parametrize("dimensions", [1, 3, 5])
+def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, dimensions):
+    rng = np.random.default_rng(dimensions)
+    period, bandwidths = np.full(dimensions, np.inf), rng.uniform(0.3, 2.0, dimensions)
+    period[dimensions // 2], bandwidths[-1] = 2.0, 0.0  # one dimension is a circle, one is left out
+    bandwidths[0] = 0.7
+    features = RadialBasis(rng.normal(size=(20, dimensions)), bandwidths, period, normalised)
+    states = rng.normal(size=(300, dimensions))
+    states[:2] *= 1e4  # far from all centres, where every exponential is zero
+    multiples = settings(features, inferred=True, rng=rng)
+    weights = [rng.normal(size=(20, 1 + number % 3)) for number in range(len(multiples))]
+    values = values_under(features, multiples, states, weights)
+    path = Trajectory(states, np.zeros((299, 1)), np.zeros(299), False)
+    sums = sums_under(features, multiples, [path, path], discount=0.9)
+    for row, columns, value, total in zip(multiples, weights, values, sums, strict=True):
+        alone = features.rescaled(row)
+        np.testing.assert_allclose(value, alone(states) @ columns, rtol=1e-9, atol=1e-11)
+        expected = trajectory_features([path, path], alone, discount=0.9)
+        np.testing.assert_allclose(total, expected, rtol=1e-9, atol=1e-11)

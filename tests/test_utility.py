@@ -165,7 +165,7 @@ def test_fewer_draws_are_some_of_all_evenly_spaced(walked):
     every = every.reshape(chains, length, len(states))
     for number, apart in ((chains * length, 1), (100, length * chains // 100), (1, chains * length)):
         mean, draws = estimate.utilities_and_draws(states, number=number)
-        np.testing.assert_array_equal(mean, estimate.utilities(states))
+        np.testing.assert_allclose(mean, estimate.utilities(states), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(draws, every[:, ::apart].reshape(-1, len(states)), rtol=1e-9, atol=1e-12)
     with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
         estimate.utilities_and_draws(states, number=0)

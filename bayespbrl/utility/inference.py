@@ -13,7 +13,7 @@ from bayespbrl.models import Answers, PreferenceModel, linear_program, posterior
 from bayespbrl.models.posterior_tree import bases_of
 from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
-from bayespbrl.utility.length_scales import rescaled, settings
+from bayespbrl.utility.length_scales import settings, sums_under
 from bayespbrl.utility.point_estimates import KnownReward, LinearProgramUtility
 from bayespbrl.utility.posterior_utility import PosteriorUtility
 from bayespbrl.utility.quality import FitQuality
@@ -69,7 +69,7 @@ def estimate(
         return _by_linear_program(comparisons.feature_sums(features), comparisons, features)
     rng = np.random.default_rng([seed, 2])
     multiples = settings(features, inferred=options.hyperparameters == "inferred", rng=rng)
-    sums = [comparisons.feature_sums(rescaled(features, row)) for row in multiples]
+    sums = sums_under(features, multiples, comparisons.trajectories, discount=comparisons.discount)
     return _by_posterior(sums, multiples, comparisons, features, options.utility, model, seed)
 
 

@@ -6,15 +6,18 @@ Volinsky 1999).
 """
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from bayespbrl.features import RadialBasis, StateFeatures
+from bayespbrl.features import RadialBasis, StateFeatures, linear
+from bayespbrl.trajectories import Trajectory, trajectory_features
 
 # The prior: a uniform distribution over these multiples of the bandwidths as given, in each dimension.
 MULTIPLES = (1.0, 3.0, 9.0)
+ROWS_AT_A_TIME = 256  # keeps the factors of all settings in the processor's cache
 MOST_SETTINGS = 27  # beyond three dimensions, so many points of the grid: the equal ones, and others at random
 
 
@@ -34,3 +37,42 @@ def settings(features: StateFeatures, *, inferred: bool, rng: np.random.Generato
 def rescaled(features: StateFeatures, multiples: ArrayLike) -> StateFeatures:
     """φ with `multiples` of its bandwidths, where it has any."""
     return features.rescaled(multiples) if isinstance(features, RadialBasis) else features
+
+
+def values_under(
+    features: StateFeatures,
+    multiples: Float[np.ndarray, "c s"],
+    states: np.ndarray,
+    weights: Sequence[Float[np.ndarray, "d _"]],
+) -> list[Float[np.ndarray, "n _"]]:
+    """φ(s)ᵀw of n states under each of C settings, with the weights of each side by side."""
+    if not isinstance(features, RadialBasis) or len(multiples) == 1:
+        return [
+            linear(rescaled(features, row)(states), columns) for row, columns in zip(multiples, weights, strict=True)
+        ]
+    values = [np.empty((len(states), columns.shape[1])) for columns in weights]
+    for start in range(0, len(states), ROWS_AT_A_TIME):
+        rows = slice(start, start + ROWS_AT_A_TIME)
+        for number, (kernel, shares) in enumerate(features.under(multiples, states[rows])):
+            values[number][rows] = shares[:, None] * (kernel @ weights[number])
+    return values
+
+
+def sums_under(
+    features: StateFeatures,
+    multiples: Float[np.ndarray, "c s"],
+    trajectories: Sequence[Trajectory],
+    *,
+    discount: float,
+) -> Sequence[Float[np.ndarray, "n d"]]:
+    """ψ(τ) of n trajectories under each of C settings, as `trajectory_features`."""
+    if not isinstance(features, RadialBasis) or len(multiples) == 1:
+        return [trajectory_features(trajectories, rescaled(features, row), discount=discount) for row in multiples]
+    sums = np.zeros((len(multiples), len(trajectories), len(features.centres)))
+    for i, trajectory in enumerate(trajectories):
+        discounts = discount ** np.arange(len(trajectory))
+        for start in range(0, len(trajectory), ROWS_AT_A_TIME):
+            rows = slice(start, start + ROWS_AT_A_TIME)
+            for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):
+                sums[number, i] += (discounts[rows] * shares) @ kernel  # eq. 1
+    return list(sums)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from bayespbrl.features import StateFeatures
+from bayespbrl.features import StateFeatures, linear
 from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
 from bayespbrl.utility.estimate import WithoutDraws
-from bayespbrl.utility.posterior_utility import linear
 from bayespbrl.utility.quality import FitQuality
 
 

@@ -9,13 +9,14 @@ from jaxtyping import Float
 from xarray import DataTree
 
 from bayespbrl import checks
-from bayespbrl.features import StateFeatures
+from bayespbrl.features import StateFeatures, linear
 from bayespbrl.models.likelihoods import Likelihood, likelihood_of
-from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
-from bayespbrl.utility.length_scales import rescaled
+from bayespbrl.trajectories import Trajectory, Transitions
+from bayespbrl.utility.length_scales import rescaled, sums_under, values_under
 from bayespbrl.utility.quality import FitQuality
 
-Table = Callable[[StateFeatures], np.ndarray]  # of the features of one setting: of states, or of trajectories
+# From the numbers of some settings, and weights of each side by side, (D, m), to wᵀφ or wᵀψ of each row, (n, m).
+Evaluate = Callable[[np.ndarray, Sequence[np.ndarray]], Sequence[np.ndarray]]
 INTERVAL = (0.05, 0.95)
 
 
@@ -65,7 +66,7 @@ class PosteriorUtility:
 
     def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
         """The utility of n states."""
-        return self._drawn(_of_states(states), None)[0]
+        return self._drawn(self._of_states(states), None)[0]
 
     def prior_deviations(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
         """Prior standard deviation of the utility of n states."""
@@ -81,7 +82,7 @@ class PosteriorUtility:
         self, states: np.ndarray, *, number: int | None = None
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
         """The utility of n states and draws of it, from one evaluation of the features."""
-        return self._drawn(_of_states(states), self._apart(number))
+        return self._drawn(self._of_states(states), self._apart(number))
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
         """wᵀψ(τ) of each trajectory."""
@@ -100,7 +101,7 @@ class PosteriorUtility:
 
     def differences(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, "c n d"]:
         """ψ(first) − ψ of each trajectory under every setting, in the units of the posterior's differences."""
-        sums = [self._of_trajectories(trajectories)(self._setting(number)) for number in range(len(self.scales))]
+        sums = sums_under(self.features, self.multiples, trajectories, discount=self.discount)
         return np.array([(each[:1] - each[1:]) / scale for each, scale in zip(sums, self.scales, strict=True)])
 
     def hyperparameters(self) -> dict[str, Any]:
@@ -130,40 +131,35 @@ class PosteriorUtility:
         setting = self.posterior.children["posterior"].dataset["setting"]
         return spacing(setting.size, number)
 
-    def _of_trajectories(self, trajectories: Sequence[Trajectory]) -> Table:
-        return lambda features: trajectory_features(trajectories, features, discount=self.discount)
+    def _of_states(self, states: np.ndarray) -> Evaluate:
+        return lambda settings, weights: values_under(self.features, self.multiples[settings], states, weights)
 
-    def _drawn(self, table: Table, apart: int | None) -> tuple[np.ndarray, np.ndarray]:
-        """The utility of each of n rows of `table`, (n,), and every `apart`-th draw of it, (S, n); None: no draws."""
+    def _of_trajectories(self, trajectories: Sequence[Trajectory]) -> Evaluate:
+        def values(settings: np.ndarray, weights: Sequence[np.ndarray]) -> list[np.ndarray]:
+            sums = sums_under(self.features, self.multiples[settings], trajectories, discount=self.discount)
+            return [linear(each, columns) for each, columns in zip(sums, weights, strict=True)]
+
+        return values
+
+    def _drawn(self, evaluate: Evaluate, apart: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """The utility of each of n rows, (n,), and every `apart`-th draw of it, (S, n); None: no draws."""
         drawn = self.posterior.children["posterior"].dataset
         every = slice(0, 0) if apart is None else slice(None, None, apart)
         settings, weights = drawn["setting"].values[:, every], drawn["utility_weights"][:, every].values
-        mean, draws = np.zeros(0), np.zeros((*settings.shape, 0))
-        for number, part in enumerate(self.weights):
-            chosen = settings == number
-            if not chosen.any() and not part.any() and number > 0:
-                continue
-            features = table(self._setting(number))
-            if number == 0:
-                mean, draws = np.zeros(len(features)), np.empty((*settings.shape, len(features)))
-            mean += linear(features, part)
-            draws[chosen] = weights[chosen] @ features.T / self.scales[number]
-        return mean, draws.reshape(-1, draws.shape[2])
-
-
-def _of_states(states: np.ndarray) -> Table:
-    return lambda features: features(states)
-
-
-def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " n"]:
-    """wᵀφ of each row of φ, (n, D).
-
-    Raises:
-      ValueError: features of another length than the weights, as a function of the user's may return.
-    """
-    if features.shape[1] != len(weights):
-        raise ValueError(f"features: expected {len(weights)} of each state, as before, got {features.shape[1]}")
-    return features @ weights
+        needed = np.union1d(np.flatnonzero(self.weights.any(axis=1)), np.unique(settings)).astype(int)
+        needed = needed if len(needed) else np.zeros(1, int)  # a utility of zero has values too
+        chosen = [settings == number for number in needed]
+        values = evaluate(
+            needed,
+            [
+                np.column_stack([self.weights[number], weights[its].T / self.scales[number]])
+                for number, its in zip(needed, chosen, strict=True)
+            ],
+        )
+        draws = np.empty((*settings.shape, len(values[0])))
+        for its, columns in zip(chosen, values, strict=True):
+            draws[its] = columns[:, 1:].T
+        return np.sum([columns[:, 0] for columns in values], axis=0), draws.reshape(-1, draws.shape[2])
 
 
 def spacing(total: int, number: int | None) -> int:
