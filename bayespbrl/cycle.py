@@ -173,15 +173,16 @@ class Cycle:
         """Step 1."""
         settings = self.settings
         rng = self._rng(FEATURES, 2 * state.iteration)
-        known = state.preferences
+        known, rows = state.preferences, state.preferences.rows()
         # Decision: a person may favour a side. The simulated expert does not, and each unknown costs answers.
-        sides = () if settings.expert == "return" else known.shown_first
+        sides = None if settings.expert == "return" else [row.side for row in rows]
         return estimate(
             Comparisons.among(
                 state.trajectories,
                 known.pairs,
                 ties=known.ties,
-                shown_first=sides,
+                sides=sides,
+                answered_by=[row.answerer for row in rows],
                 discount=settings.trajectory_discount,
             ),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),

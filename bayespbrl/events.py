@@ -4,7 +4,7 @@ Resuming a run, undoing an answer and reporting on a run in progress all use thi
 
 * `collected`: new trajectories (step 3), and which of them to ask about, in order (step 4);
 * `asked`: a question, with the order in which the two trajectories were shown;
-* `answered`: the expert's answer;
+* `answered`: the expert's answer; `answerer`, the name of who gave it, and `seconds`, the time they took, where known;
 * `improved`: a new estimate and a new policy (steps 1 and 2), which end an iteration;
 * `undone`: the last answer and everything after it is taken back.
 """
@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from bayespbrl import checks
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
 from bayespbrl.settings import Settings
@@ -207,18 +208,39 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     )
 
 
+def answered(query: int, answer: Answer, *, answerer: str | None = None, seconds: float | None = None) -> Entry:
+    """The event of an answer to question number `query`; arguments as of `Learner.tell`.
+
+    Raises:
+      ValueError: an answerer that is no short name, or a time that is no finite number >= 0.
+    """
+    event: dict[str, Any] = {"event": "answered", "query": query, "answer": str(answer)}
+    if answerer is not None:
+        event["answerer"] = checks.short_name("answerer", answerer)
+    if seconds is not None:
+        event["seconds"] = checks.non_negative("seconds", seconds)
+    return Entry(event)
+
+
 def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     query = state.query
     if query is None or query.number != event["query"]:
         raise ValueError(f"answered: expected an answer to {query}, got one to question {event['query']}")
     left = tuple(number for number in state.candidates if number != query.newcomer)
     after = replace(state, query=None, candidates=left, previous=state)
-    answer = parse_answer(event["answer"])
+    answer, answerer = parse_answer(event["answer"]), event.get("answerer")
+    if answerer is not None:
+        checks.short_name("answerer", answerer)
     if answer is Answer.SKIP:
         return after
     preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]
     preferences = state.preferences.add(
-        query.newcomer, query.incumbent, preferred=preferred, rivals=state.rivals, shown_first=query.first
+        query.newcomer,
+        query.incumbent,
+        preferred=preferred,
+        rivals=state.rivals,
+        shown_first=query.first,
+        answerer=answerer,
     )
     return replace(after, preferences=preferences, wanted=state.wanted - 1)
 
