@@ -182,7 +182,7 @@ class Cycle:
                 known.pairs,
                 ties=known.ties,
                 sides=sides,
-                answered_by=[row.answerer for row in rows],
+                answered_by=[row.answerer or "" for row in rows],
                 discount=settings.trajectory_discount,
             ),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),

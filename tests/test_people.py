@@ -107,7 +107,8 @@ def test_all_that_follows_from_an_answer_is_its_answerers_and_only_what_was_show
 def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
     trajectories, pairs = [object()] * 4, [(0, 1), (2, 1), (3, 0)]
     several = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob", "Ada", "Bob"])
-    assert several.answers.answerers.tolist() == [0, 1, 0]
+    checked = several.answers.checked(3)
+    assert (checked.answerers.tolist(), checked.names) == ([0, 1, 0], ("Bob", "Ada"))
     one = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob"] * 3)
     assert one.answers == Comparisons.among(trajectories, pairs, discount=1.0).answers
 
