@@ -39,6 +39,8 @@ class Query:
       first, second: numbers of the two trajectories in the order shown, which is drawn at random.
       newcomer: number of the new one; the other is the newest undominated trajectory.
       trajectories: the two trajectories, in the order shown.
+      repeats: number of the earlier question about the same two, which were then shown the other way round; None for a
+        new question.
     """
 
     number: int
@@ -46,10 +48,29 @@ class Query:
     second: int
     newcomer: int
     trajectories: tuple[Trajectory, Trajectory]
+    repeats: int | None = None
 
     @property
     def incumbent(self) -> int:
         return self.second if self.newcomer == self.first else self.first
+
+
+class PastQuestion(NamedTuple):
+    """A question with its answer.
+
+    Attributes:
+      number, first, second, newcomer, repeats: as of `Query`.
+      answer: `FIRST`, `SECOND`, `TIE` or `SKIP`.
+      answerer: who gave it; None: not known.
+    """
+
+    number: int
+    first: int
+    second: int
+    newcomer: int
+    repeats: int | None
+    answer: Answer
+    answerer: str | None
 
 
 class Source(NamedTuple):
@@ -162,6 +183,23 @@ class Preferences:
             new_pairs = tuple((member, newcomer) for member in beside)
         after = Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, self.sources)
         return after._with_sources(self, asked, shown_first, answerer)
+
+    def add_repeated(
+        self, first: int, second: int, *, preferred: int | None, answerer: str | None = None
+    ) -> "Preferences":
+        """The preferences after a repeated question, with the first shown first: one more pair or tie.
+
+        Decision: the undominated trajectories stay. Answers that contradict each other are for the posterior to weigh.
+        """
+        other = second if preferred == first else first
+        pairs, ties = self.pairs, self.ties
+        asked = (first, second) if preferred is None else (preferred, other)
+        if preferred is None:
+            ties = (*ties, asked)
+        else:
+            pairs = (*pairs, asked)
+        after = replace(self, pairs=pairs, ties=ties, answers=self.answers + 1)
+        return after._with_sources(self, asked, first, answerer)
 
     def _with_sources(
         self, before: "Preferences", asked: tuple[int, int], shown_first: int | None, answerer: str | None

@@ -5,7 +5,7 @@ import json
 import pytest
 from toys import QUICK, fingerprint
 
-from bayespbrl import Learner, Preferences, ReturnExpert, resume, start
+from bayespbrl import Learner, Preferences, ReturnExpert, queries, resume, start
 from bayespbrl.events import Entry, LearnerState, apply
 from bayespbrl.preferences import Source
 from bayespbrl.utility.comparisons import Comparisons
@@ -116,3 +116,93 @@ def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
 def test_nobody_has_answered_a_new_run_and_an_answer_without_a_name_is_somebodys():
     assert LearnerState("policy").preferences.answerers == ()
     assert Preferences(answers=1).answerers == (None,)
+
+
+def answering(run, choose, number=100, **who):
+    """Answer at most `number` questions by `choose`, and return them."""
+    asked = []
+    while len(asked) < number and (questions := run.ask()):
+        asked.append(questions[0])
+        run.tell([choose(questions[0])], **who)
+    return asked
+
+
+def always_the_first(query):
+    return "first"
+
+
+PEOPLE = OPTIONS | {"expert": "other", "iterations": 12, "max_steps": 5, "evaluation_episodes": 1}
+
+
+def test_a_share_of_the_questions_is_an_earlier_one_with_sides_swapped_and_its_answer_is_one_more():
+    run, _ = remembered(**PEOPLE, repeats=0.25)
+    asked = answering(run, always_the_first, answerer="Ada")
+    repeats = [query for query in asked if query.repeats is not None]
+    assert len(asked) == 13 + len(repeats)  # what an iteration wants is asked beside them
+    assert len(repeats) == len(asked) // 4
+    assert len({query.repeats for query in repeats}) == len(repeats)  # each once
+    for query in repeats:
+        earlier = asked[query.repeats - 1]
+        assert earlier.repeats is None
+        assert (query.first, query.second) == (earlier.second, earlier.first)
+        assert query.trajectories == earlier.trajectories[::-1]
+        assert query.number - earlier.number > queries.LEAST_BETWEEN
+        # whoever always chooses the first contradicts themselves: both answers are data
+        assert {(earlier.first, earlier.second), (query.first, query.second)} <= set(run.preferences.pairs)
+    assert run.preferences.answers == len(asked)
+    sides = [source.side for source in run.preferences.rows()]
+    assert set(sides) <= {1, 0}
+    assert sides.count(1) == len(asked)
+
+
+def test_repeated_questions_replay_and_undo(tmp_path):
+    straight = Learner("gridworld", **PEOPLE, repeats=0.25)
+    answering(straight, always_the_first)
+    run = start("gridworld", tmp_path / "run", **PEOPLE, repeats=0.25)
+    while (question := run.ask()[0]).repeats is None:
+        run.tell(["first"])
+    run.tell(["tie"])
+    assert run.preferences.ties[-1] == (question.first, question.second)
+    again = resume(tmp_path / "run")
+    assert (again.preferences, again.state.past) == (run.preferences, run.state.past)
+    again.undo()
+    (waiting,) = again.ask()
+    assert (waiting.number, waiting.first, waiting.repeats) == (question.number, question.first, question.repeats)
+    answering(again, always_the_first)
+    assert fingerprint(again) == fingerprint(straight)
+
+
+def test_a_repeated_question_that_nobody_can_answer_costs_nothing():
+    run, _ = remembered(**PEOPLE, repeats=0.25)
+    asked = answering(run, lambda query: "first" if query.repeats is None else "skip")
+    skipped = [query for query in asked if query.repeats is not None]
+    assert skipped
+    assert run.preferences.answers == 13 == len(asked) - len(skipped)
+
+
+def test_repeated_questions_stay_within_the_budget_and_are_of_the_one_who_answers():
+    run, _ = remembered(**PEOPLE, repeats=0.4, answers=9)
+    answering(run, always_the_first, 5, answerer="Ada")
+    asked = answering(run, always_the_first, 5, answerer="Bob")
+    assert run.preferences.answers == 9
+    past = {question.number: question for question in run.state.past}
+    later = [query for query in asked[1:] if query.repeats is not None]
+    assert all(past[query.repeats].answerer == "Bob" for query in later)
+
+
+def test_people_are_asked_a_tenth_again_and_a_simulated_expert_nothing():
+    assert Learner("gridworld", expert="other").settings.questions.repeats == 0.1
+    assert Learner("gridworld", expert="terminal", repeats=0.0).settings.questions.repeats == 0
+    assert Learner("gridworld").settings.questions.repeats == 0
+    with pytest.raises(ValueError, match=r"repeats: expected a number in \[0, 1\), got 1"):
+        Learner("gridworld", repeats=1)
+
+
+def test_what_repeats_no_earlier_question_is_refused():
+    run, _ = remembered()
+    answering(run, always_the_first, 1)
+    (first,) = run.state.past
+    waiting = run.ask()[0].number
+    event = {"event": "asked", "query": waiting, "first": first.first, "second": first.second, "newcomer": first.first}
+    with pytest.raises(ValueError, match="asked: expected a question that was asked before with sides swapped"):
+        apply(run.state, Entry(event | {"repeats": first.number}))
