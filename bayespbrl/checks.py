@@ -42,6 +42,17 @@ def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     return str(value)
 
 
+LONGEST_NAME = 64
+
+
+def short_name(name: str, value: Any) -> str:
+    """`value`, where it is a printable string of 1 to `LONGEST_NAME` characters without spaces at its ends."""
+    fits = isinstance(value, str) and 0 < len(value) <= LONGEST_NAME and value.isprintable() and value == value.strip()
+    if not fits:
+        raise ValueError(f"{name}: expected a printable name of 1 to {LONGEST_NAME} characters, got {value!r}")
+    return str(value)
+
+
 def finite(name: str, values: Any) -> None:
     """That an array holds no NaN and no infinity."""
     if not np.all(np.isfinite(values)):

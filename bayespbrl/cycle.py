@@ -29,7 +29,7 @@ from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.inference import estimate
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS = range(9)
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT = range(10)
 # Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
 
@@ -98,12 +98,17 @@ class Cycle:
         return [first + (i // 2 if state.iteration == 0 else i) for i in range(number)]
 
     def show(self, state: LearnerState) -> Entry:
-        """Step 4: the next question, the best candidate against its opponent; `asked`."""
-        number, newcomer = state.queries + 1, state.candidates[0]
+        """Step 4: the next question, the best candidate against its opponent, or a repeated one; `asked`."""
+        number, newcomer, options = state.queries + 1, state.candidates[0], self.settings.questions
+        left = options.left(state.preferences.answers + state.wanted)
+        again = queries.repeated(state.past, number, options, left=left, rng=self._rng(REPEAT, number))
+        if again is not None:
+            shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
+            return _entry({"event": "asked", "query": number, **shown, "repeats": again.number})
         incumbent = state.opponents[newcomer] if state.opponents else state.preferences.undominated[-1]
         query = queries.show(number, newcomer, incumbent, state.trajectories, rng=self._rng(SHOW, number))
         event = {"event": "asked", "query": number, "first": query.first, "second": query.second, "newcomer": newcomer}
-        if self.settings.questions.same_start:
+        if options.same_start:
             event["rivals"] = rivals(query, state.trajectories, state.preferences)
         return _entry(event)
 
@@ -173,15 +178,16 @@ class Cycle:
         """Step 1."""
         settings = self.settings
         rng = self._rng(FEATURES, 2 * state.iteration)
-        known = state.preferences
+        known, rows = state.preferences, state.preferences.rows()
         # Decision: a person may favour a side. The simulated expert does not, and each unknown costs answers.
-        sides = () if settings.expert == "return" else known.shown_first
+        sides = None if settings.expert == "return" else [row.side for row in rows]
         return estimate(
             Comparisons.among(
                 state.trajectories,
                 known.pairs,
                 ties=known.ties,
-                shown_first=sides,
+                sides=sides,
+                answered_by=[row.answerer or "" for row in rows],
                 discount=settings.trajectory_discount,
             ),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),

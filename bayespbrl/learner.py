@@ -1,5 +1,6 @@
 """The learner: asks, takes answers, and moves through the cycle in between."""
 
+import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -156,24 +157,38 @@ class Learner:
         self._advance()
         return self._waiting()
 
-    def tell(self, answers: Sequence[Answer | str]) -> None:
+    def tell(
+        self, answers: Sequence[Answer | str], *, answerer: str | None = None, seconds: float | None = None
+    ) -> None:
         """Take in the answer to the question that waits, and move on as far as possible without another.
 
+        Args:
+          answers: one, to the question that `ask` returned.
+          answerer: name of who gave it, printable, at most 64 characters; each of several has a lapse rate.
+          seconds: how long they took, which is kept beside the answer.
+
         Raises:
-          ValueError: an answer that is none, or not as many answers as questions; nothing has happened then.
+          ValueError: an answer that is none, not as many answers as questions, or a bad name or time; nothing has
+            happened then.
         """
-        self._take_in(answers)
+        self._take_in(answers, answerer, seconds)
         self._advance()
 
-    def _take_in(self, answers: Sequence[Answer | str]) -> None:
+    def _take_in(self, answers: Sequence[Answer | str], answerer: str | None, seconds: float | None) -> None:
         waiting = self._waiting()
         if isinstance(answers, str) or not isinstance(answers, Sequence) or len(answers) != len(waiting):
             raise ValueError(f"tell: expected a list of {len(waiting)} answers, one a question, got {answers!r}")
-        for query, answer in zip(waiting, map(parse_answer, answers), strict=True):
+        parsed = [parse_answer(answer) for answer in answers]
+        numbers = [query.number for query in waiting]
+        entries = [
+            events.answered(number, answer, answerer=answerer, seconds=seconds)
+            for number, answer in zip(numbers, parsed, strict=True)
+        ]
+        for entry, answer in zip(entries, parsed, strict=True):
             if answer is Answer.UNDO:
                 self.undo()
             else:
-                self._record(Entry({"event": "answered", "query": query.number, "answer": str(answer)}))
+                self._record(entry)
 
     def undo(self) -> None:
         """Take the last answer back, and what followed from it; its question waits again.
@@ -183,19 +198,28 @@ class Learner:
         """
         self._record(Entry({"event": "undone"}))
 
-    def run(self, expert: Expert, *, progress: Callable[["Learner"], None] | None = None) -> "Learner":
+    def run(
+        self,
+        expert: Expert,
+        *,
+        answerer: str | None = None,
+        progress: Callable[["Learner"], None] | None = None,
+    ) -> "Learner":
         """Ask `expert` until all iterations are completed.
 
         Args:
           expert: called with the two trajectories in the order shown.
+          answerer: the name of a person who answers; how long each answer took is then kept too.
           progress: called after each iteration, those that ask nothing among them.
         """
         self._advance(progress)
         while questions := self._waiting():
+            began = time.perf_counter()
             answers = [parse_answer(expert(*query.trajectories)) for query in questions]
+            seconds = None if answerer is None else time.perf_counter() - began
             if answers == [Answer.UNDO] and self.state.previous is None:
                 continue  # nothing to take back: the same question again
-            self._take_in(answers)
+            self._take_in(answers, answerer, seconds)
             self._advance(progress)
         return self
 

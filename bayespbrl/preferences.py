@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,7 @@ class Answer(StrEnum):
     FIRST = "first"
     SECOND = "second"
     TIE = "tie"
-    SKIP = "skip"  # no answer: the question does not count, and another trajectory is asked about
+    SKIP = "skip"  # "cannot tell": kept, but it teaches nothing and does not count; another trajectory is asked about
     UNDO = "undo"  # takes the previous answer back, and its question is asked again
 
 
@@ -38,6 +39,8 @@ class Query:
       first, second: numbers of the two trajectories in the order shown, which is drawn at random.
       newcomer: number of the new one; the other is the newest undominated trajectory.
       trajectories: the two trajectories, in the order shown.
+      repeats: number of the earlier question about the same two, which were then shown the other way round; None for a
+        new question.
     """
 
     number: int
@@ -45,10 +48,45 @@ class Query:
     second: int
     newcomer: int
     trajectories: tuple[Trajectory, Trajectory]
+    repeats: int | None = None
 
     @property
     def incumbent(self) -> int:
         return self.second if self.newcomer == self.first else self.first
+
+
+class PastQuestion(NamedTuple):
+    """A question with its answer.
+
+    Attributes:
+      number, first, second, newcomer, repeats: as of `Query`.
+      answer: `FIRST`, `SECOND`, `TIE` or `SKIP`.
+      answerer: who gave it; None: not known.
+    """
+
+    number: int
+    first: int
+    second: int
+    newcomer: int
+    repeats: int | None
+    answer: Answer
+    answerer: str | None
+
+
+class Source(NamedTuple):
+    """Where a pair or a tie comes from.
+
+    Attributes:
+      tied: whether it is a tie.
+      number: of the pair, or of the tie, from 0.
+      side: 1 where its first was shown first, −1 where its second was, 0 where it was not asked about itself.
+      answerer: who answered; None: not known.
+    """
+
+    tied: bool
+    number: int
+    side: int
+    answerer: str | None
 
 
 @dataclass(frozen=True)
@@ -61,15 +99,42 @@ class Preferences:
       undominated: those of the shown that no answer puts below another of their start, the newest last. Where all
         are compared with one another, they are the best so far and tie.
       answers: number of answered questions, ties included.
-      shown_first: those of the pairs and ties that were asked about, each with 1 where its first was shown first and −1
-        where its second was; what follows from an answer for other rivals was shown to nobody.
+      sources: of the pairs and ties of which anything is known, in the order of the answers.
     """
 
     pairs: tuple[tuple[int, int], ...] = ()
     undominated: tuple[int, ...] = ()
     answers: int = 0
     ties: tuple[tuple[int, int], ...] = ()
-    shown_first: tuple[tuple[tuple[int, int], int], ...] = ()
+    sources: tuple[Source, ...] = ()
+
+    @property
+    def shown_first(self) -> tuple[tuple[tuple[int, int], int], ...]:
+        """Those of the pairs and ties that were asked about, each with the side of its `Source`.
+
+        What follows from an answer for other rivals was shown to nobody.
+        """
+        return tuple((self._pair(source), source.side) for source in self.sources if source.side)
+
+    @property
+    def answered_by(self) -> tuple[tuple[tuple[int, int], str], ...]:
+        """Those of the pairs and ties whose answerer is known, each with the answerer's name."""
+        return tuple((self._pair(each), each.answerer) for each in self.sources if each.answerer is not None)
+
+    @property
+    def answerers(self) -> tuple[str | None, ...]:
+        """All who answered, each once, in the order of their first answers; None is whoever gave no name."""
+        return tuple(dict.fromkeys(source.answerer for source in self.sources)) or (None,) * bool(self.answers)
+
+    def rows(self) -> list[Source]:
+        """The source of each pair, then of each tie."""
+        known = {(source.tied, source.number): source for source in self.sources}
+        keys = [(False, number) for number in range(len(self.pairs))]
+        keys += [(True, number) for number in range(len(self.ties))]
+        return [known.get(key, Source(*key, 0, None)) for key in keys]
+
+    def _pair(self, source: Source) -> tuple[int, int]:
+        return (self.ties if source.tied else self.pairs)[source.number]
 
     def start(self, trajectory: int) -> "Preferences":
         """The same preferences with `trajectory` as the first undominated one."""
@@ -83,6 +148,7 @@ class Preferences:
         preferred: int | None,
         rivals: Sequence[int] | None = None,
         shown_first: int | None = None,
+        answerer: str | None = None,
     ) -> "Preferences":
         """The preferences after one comparison of a newcomer with an incumbent.
 
@@ -93,6 +159,7 @@ class Preferences:
           rivals: the undominated trajectories that the newcomer is compared with, the incumbent among them unless it
             was never shown; None: all.
           shown_first: which of the two was; None: not known.
+          answerer: who answered; None: not known.
 
         Raises:
           ValueError: without `rivals`, an incumbent that is not the newest undominated one; a preferred that is neither
@@ -114,8 +181,39 @@ class Preferences:
             new_pairs, standing = tuple((newcomer, member) for member in beside), (*others, newcomer)
         else:
             new_pairs = tuple((member, newcomer) for member in beside)
-        sides = self.shown_first if shown_first is None else (*self.shown_first, (asked, side_of(asked, shown_first)))
-        return Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, sides)
+        after = Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, self.sources)
+        return after._with_sources(self, asked, shown_first, answerer)
+
+    def add_repeated(
+        self, first: int, second: int, *, preferred: int | None, answerer: str | None = None
+    ) -> "Preferences":
+        """The preferences after a repeated question, with the first shown first: one more pair or tie.
+
+        Decision: the undominated trajectories stay. Answers that contradict each other are for the posterior to weigh.
+        """
+        other = second if preferred == first else first
+        pairs, ties = self.pairs, self.ties
+        asked = (first, second) if preferred is None else (preferred, other)
+        if preferred is None:
+            ties = (*ties, asked)
+        else:
+            pairs = (*pairs, asked)
+        after = replace(self, pairs=pairs, ties=ties, answers=self.answers + 1)
+        return after._with_sources(self, asked, first, answerer)
+
+    def _with_sources(
+        self, before: "Preferences", asked: tuple[int, int], shown_first: int | None, answerer: str | None
+    ) -> "Preferences":
+        """The same with the sources of the pairs and ties that were not there before."""
+        if shown_first is None and answerer is None:
+            return self
+        side = 0 if shown_first is None else side_of(asked, shown_first)
+        new = [
+            Source(tied, number, side if every[number] == asked else 0, answerer)
+            for tied, every, first in ((False, self.pairs, len(before.pairs)), (True, self.ties, len(before.ties)))
+            for number in range(first, len(every))
+        ]
+        return replace(self, sources=(*self.sources, *new))
 
     def differences(self, trajectory_features: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
         """ψ(preferred) − ψ(dominated) for each pair (eq. 5), from ψ of all trajectories."""

@@ -36,7 +36,8 @@ class Comparisons:
         *,
         discount: float,
         ties: Sequence[tuple[int, int]] = (),
-        shown_first: Sequence[tuple[tuple[int, int], int]] = (),
+        sides: Sequence[int] | None = None,
+        answered_by: Sequence[str] | None = None,
     ) -> "Comparisons":
         """Those of `trajectories` that `pairs` and `ties` name, or the first where they name none.
 
@@ -44,19 +45,21 @@ class Comparisons:
           trajectories: by number.
           pairs, ties: of their numbers.
           discount: γ of ψ.
-          shown_first: as of `Preferences`; where there is any, a side bias is inferred.
+          sides: of the pairs and then the ties, as of `Source`; where there are any, a side bias is inferred.
+          answered_by: names, of the pairs and then the ties; each of several has a lapse rate and a side bias.
         """
         every = (*pairs, *ties)
         numbers = sorted({number for pair in every for number in pair} or {0})
         row = {number: position for position, number in enumerate(numbers)}
-        tied, sides = np.arange(len(every)) >= len(pairs), dict(shown_first)
+        tied = np.arange(len(every)) >= len(pairs)
         return cls(
             tuple(trajectories[n] for n in numbers),
             tuple((row[i], row[j]) for i, j in every),
             discount,
             Answers(
                 indifferent=tied if ties else None,
-                shown_first=np.array([sides.get((i, j), 0) for i, j in every]) if sides else None,
+                shown_first=None if sides is None or not any(sides) else np.array(sides),
+                answerers=None if answered_by is None or len(set(answered_by)) < 2 else np.array(answered_by),
             ),
         )
 

@@ -176,7 +176,7 @@ def _predicted(contents: RunContents, answer: AnsweredQuestion) -> AnsweredQuest
         return replace(answer, predicted=0.5)  # without any answer, either is equally probable
     if contents.posterior is None or contents.features_missing:
         return answer
-    return replace(answer, predicted=first_preferred_probability(contents.estimate, *both))
+    return replace(answer, predicted=first_preferred_probability(contents.estimate, *both, answerer=answer.answerer))
 
 
 def _damaged(contents: RunContents, what: str, remedy: str) -> RunContents:

@@ -1,0 +1,208 @@
+"""Answers of people: who gave each, how long it took, and what is kept of it."""
+
+import json
+
+import pytest
+from toys import QUICK, fingerprint
+
+from bayespbrl import Learner, Preferences, ReturnExpert, queries, resume, start
+from bayespbrl.events import Entry, LearnerState, apply
+from bayespbrl.preferences import Source
+from bayespbrl.utility.comparisons import Comparisons
+
+OPTIONS = QUICK | {"iterations": 2}
+
+
+class Memory:
+    """A log in memory."""
+
+    def __init__(self):
+        self.entries = []
+
+    def append(self, entry, state):
+        self.entries.append(entry)
+
+    def answers(self):
+        return [entry.event for entry in self.entries if entry.event["event"] == "answered"]
+
+
+def remembered(**changes):
+    log = Memory()
+    return Learner("gridworld", **(OPTIONS | changes)).logged(log), log
+
+
+def test_who_answered_and_how_long_it_took_is_in_the_log():
+    run, log = remembered()
+    run.ask()
+    run.tell(["first"], answerer="Ada", seconds=2.5)
+    run.tell(["skip"], answerer="Böb 2", seconds=0)
+    run.tell(["tie"])
+    assert log.answers() == [
+        {"event": "answered", "query": 1, "answer": "first", "answerer": "Ada", "seconds": 2.5},
+        {"event": "answered", "query": 2, "answer": "skip", "answerer": "Böb 2", "seconds": 0.0},
+        {"event": "answered", "query": 3, "answer": "tie"},
+    ]
+    assert {name for _, name in run.preferences.answered_by} == {"Ada"}
+    assert run.preferences.answerers == ("Ada", None)
+    assert run.preferences.answers == 2  # who cannot tell has not answered
+
+
+@pytest.mark.parametrize("answerer", ["", " ", "a ", "a\nb", "\x07", "x" * 65, 3, b"Ada", ["Ada"]])
+def test_a_bad_name_is_refused_and_nothing_has_happened(answerer):
+    run, log = remembered()
+    run.ask()
+    state, length = run.state, len(log.entries)
+    with pytest.raises(ValueError, match=r"answerer: expected a printable name of 1 to 64 characters, got"):
+        run.tell(["first"], answerer=answerer)
+    assert (run.state, len(log.entries)) == (state, length)
+    with pytest.raises(ValueError, match="answerer: expected a printable name"):
+        apply(state, Entry({"event": "answered", "query": 1, "answer": "tie", "answerer": answerer}))
+
+
+@pytest.mark.parametrize("seconds", [-1, float("nan"), float("inf"), "3", True, [1.0]])
+def test_a_bad_response_time_is_refused_and_nothing_has_happened(seconds):
+    run, log = remembered()
+    run.ask()
+    with pytest.raises(ValueError, match=r"seconds: expected a non-negative finite number, got"):
+        run.tell(["first"], answerer="Ada", seconds=seconds)
+    assert log.answers() == []
+    assert run.ask()[0].number == 1
+
+
+def test_a_named_person_who_answers_in_a_loop_is_timed_and_a_simulated_expert_is_not():
+    run, log = remembered()
+    run.run(ReturnExpert(), answerer="Ada")
+    assert all(event["answerer"] == "Ada" and event["seconds"] >= 0 for event in log.answers())
+    plain, plain_log = remembered()
+    plain.run(ReturnExpert())
+    assert all(set(event) == {"event", "query", "answer"} for event in plain_log.answers())
+    assert fingerprint(plain)["policy"] == fingerprint(run)["policy"]  # one answerer changes nothing
+
+
+def test_a_run_on_disk_replays_who_answered(tmp_path):
+    run = start("gridworld", tmp_path / "run", **OPTIONS)
+    run.ask()
+    run.tell(["first"], answerer="Ada", seconds=1)
+    run.tell(["second"], answerer="Bob", seconds=2)
+    again = resume(tmp_path / "run")
+    assert again.preferences == run.preferences
+    assert again.preferences.answerers == ("Ada", "Bob")
+    lines = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    assert [line["seconds"] for line in lines if line["event"] == "answered"] == [1.0, 2.0]
+
+
+def test_all_that_follows_from_an_answer_is_its_answerers_and_only_what_was_shown_has_a_side():
+    before = Preferences(undominated=(0, 2), answers=2)
+    after = before.add(7, 2, preferred=7, shown_first=2, answerer="Ada").add(
+        8, 7, preferred=None, shown_first=8, answerer="Bob"
+    )
+    assert after.answered_by == (((7, 0), "Ada"), ((7, 2), "Ada"), ((8, 7), "Bob"))
+    assert after.rows() == [
+        Source(False, 0, 0, "Ada"),
+        Source(False, 1, -1, "Ada"),
+        Source(True, 0, 1, "Bob"),
+    ]
+
+
+def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
+    trajectories, pairs = [object()] * 4, [(0, 1), (2, 1), (3, 0)]
+    several = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob", "Ada", "Bob"])
+    checked = several.answers.checked(3)
+    assert (checked.answerers.tolist(), checked.names) == ([0, 1, 0], ("Bob", "Ada"))
+    one = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob"] * 3)
+    assert one.answers == Comparisons.among(trajectories, pairs, discount=1.0).answers
+
+
+def test_nobody_has_answered_a_new_run_and_an_answer_without_a_name_is_somebodys():
+    assert LearnerState("policy").preferences.answerers == ()
+    assert Preferences(answers=1).answerers == (None,)
+
+
+def answering(run, choose, number=100, **who):
+    """Answer at most `number` questions by `choose`, and return them."""
+    asked = []
+    while len(asked) < number and (questions := run.ask()):
+        asked.append(questions[0])
+        run.tell([choose(questions[0])], **who)
+    return asked
+
+
+def always_the_first(query):
+    return "first"
+
+
+PEOPLE = OPTIONS | {"expert": "other", "iterations": 12, "max_steps": 5, "evaluation_episodes": 1}
+
+
+def test_a_share_of_the_questions_is_an_earlier_one_with_sides_swapped_and_its_answer_is_one_more():
+    run, _ = remembered(**PEOPLE, repeats=0.25)
+    asked = answering(run, always_the_first, answerer="Ada")
+    repeats = [query for query in asked if query.repeats is not None]
+    assert len(asked) == 13 + len(repeats)  # what an iteration wants is asked beside them
+    assert len(repeats) == len(asked) // 4
+    assert len({query.repeats for query in repeats}) == len(repeats)  # each once
+    for query in repeats:
+        earlier = asked[query.repeats - 1]
+        assert earlier.repeats is None
+        assert (query.first, query.second) == (earlier.second, earlier.first)
+        assert query.trajectories == earlier.trajectories[::-1]
+        assert query.number - earlier.number > queries.LEAST_BETWEEN
+        # whoever always chooses the first contradicts themselves: both answers are data
+        assert {(earlier.first, earlier.second), (query.first, query.second)} <= set(run.preferences.pairs)
+    assert run.preferences.answers == len(asked)
+    sides = [source.side for source in run.preferences.rows()]
+    assert set(sides) <= {1, 0}
+    assert sides.count(1) == len(asked)
+
+
+def test_repeated_questions_replay_and_undo(tmp_path):
+    straight = Learner("gridworld", **PEOPLE, repeats=0.25)
+    answering(straight, always_the_first)
+    run = start("gridworld", tmp_path / "run", **PEOPLE, repeats=0.25)
+    while (question := run.ask()[0]).repeats is None:
+        run.tell(["first"])
+    run.tell(["tie"])
+    assert run.preferences.ties[-1] == (question.first, question.second)
+    again = resume(tmp_path / "run")
+    assert (again.preferences, again.state.past) == (run.preferences, run.state.past)
+    again.undo()
+    (waiting,) = again.ask()
+    assert (waiting.number, waiting.first, waiting.repeats) == (question.number, question.first, question.repeats)
+    answering(again, always_the_first)
+    assert fingerprint(again) == fingerprint(straight)
+
+
+def test_a_repeated_question_that_nobody_can_answer_costs_nothing():
+    run, _ = remembered(**PEOPLE, repeats=0.25)
+    asked = answering(run, lambda query: "first" if query.repeats is None else "skip")
+    skipped = [query for query in asked if query.repeats is not None]
+    assert skipped
+    assert run.preferences.answers == 13 == len(asked) - len(skipped)
+
+
+def test_repeated_questions_stay_within_the_budget_and_are_of_the_one_who_answers():
+    run, _ = remembered(**PEOPLE, repeats=0.4, answers=9)
+    answering(run, always_the_first, 5, answerer="Ada")
+    asked = answering(run, always_the_first, 5, answerer="Bob")
+    assert run.preferences.answers == 9
+    past = {question.number: question for question in run.state.past}
+    later = [query for query in asked[1:] if query.repeats is not None]
+    assert all(past[query.repeats].answerer == "Bob" for query in later)
+
+
+def test_people_are_asked_a_tenth_again_and_a_simulated_expert_nothing():
+    assert Learner("gridworld", expert="other").settings.questions.repeats == 0.1
+    assert Learner("gridworld", expert="terminal", repeats=0.0).settings.questions.repeats == 0
+    assert Learner("gridworld").settings.questions.repeats == 0
+    with pytest.raises(ValueError, match=r"repeats: expected a number in \[0, 1\), got 1"):
+        Learner("gridworld", repeats=1)
+
+
+def test_what_repeats_no_earlier_question_is_refused():
+    run, _ = remembered()
+    answering(run, always_the_first, 1)
+    (first,) = run.state.past
+    waiting = run.ask()[0].number
+    event = {"event": "asked", "query": waiting, "first": first.first, "second": first.second, "newcomer": first.first}
+    with pytest.raises(ValueError, match="asked: expected a question that was asked before with sides swapped"):
+        apply(run.state, Entry(event | {"repeats": first.number}))
