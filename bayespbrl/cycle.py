@@ -116,7 +116,7 @@ class Cycle:
         """Steps 1 and 2, and the value of the new policy, which the learner does not see; `improved`."""
         options = self.settings.rollouts
         clock = [time.perf_counter()]
-        utility = self._estimate(state)
+        utility = self.estimate(state)
         clock.append(time.perf_counter())
         check = self._check(state, utility) if self.settings.update.checked else None
         improved, bound = self.update(state, utility, check)
@@ -174,8 +174,8 @@ class Cycle:
         )
         return checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
 
-    def _estimate(self, state: LearnerState) -> UtilityEstimate:
-        """Step 1."""
+    def estimate(self, state: LearnerState) -> UtilityEstimate:
+        """Step 1, the utility from all answers so far."""
         settings = self.settings
         rng = self._rng(FEATURES, 2 * state.iteration)
         known, rows = state.preferences, state.preferences.rows()

@@ -240,14 +240,16 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     query = state.query
     if query is None or query.number != event["query"]:
         raise ValueError(f"answered: expected an answer to {query}, got one to question {event['query']}")
-    answer, answerer = parse_answer(event["answer"]), event.get("answerer")
+    answer, answerer, seconds = parse_answer(event["answer"]), event.get("answerer"), event.get("seconds")
     if answerer is not None:
         checks.short_name("answerer", answerer)
+    if seconds is not None:
+        checks.non_negative("seconds", seconds)
     left, again = state.candidates, query.repeats is not None
     if not again:
         left = tuple(number for number in left if number != query.newcomer)
     shown = (query.number, query.first, query.second, query.newcomer, query.repeats)
-    past = (*state.past, PastQuestion(*shown, answer, answerer))
+    past = (*state.past, PastQuestion(*shown, answer, answerer, seconds))
     after = replace(state, query=None, candidates=left, past=past, previous=state)
     if answer is Answer.SKIP:
         return after

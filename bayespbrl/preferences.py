@@ -61,7 +61,7 @@ class PastQuestion(NamedTuple):
     Attributes:
       number, first, second, newcomer, repeats: as of `Query`.
       answer: `FIRST`, `SECOND`, `TIE` or `SKIP`.
-      answerer: who gave it; None: not known.
+      answerer, seconds: who gave it, and how long they took; None: not known.
     """
 
     number: int
@@ -71,6 +71,12 @@ class PastQuestion(NamedTuple):
     repeats: int | None
     answer: Answer
     answerer: str | None
+    seconds: float | None
+
+    @property
+    def preferred(self) -> int | None:
+        """Number of the preferred trajectory; None where neither is."""
+        return {Answer.FIRST: self.first, Answer.SECOND: self.second}.get(self.answer)
 
 
 class Source(NamedTuple):
@@ -200,6 +206,24 @@ class Preferences:
             pairs = (*pairs, asked)
         after = replace(self, pairs=pairs, ties=ties, answers=self.answers + 1)
         return after._with_sources(self, asked, first, answerer)
+
+    def without(self, answerer: str) -> "Preferences":
+        """The pairs and ties that do not follow from the answers of one; the undominated trajectories stay.
+
+        Raises:
+          ValueError: a name that nobody who answered has.
+        """
+        if answerer not in self.answerers:
+            names = ", ".join(repr(name) for name in self.answerers)
+            raise ValueError(f"answerer: expected one of {names or 'those who answered, nobody yet'}, got {answerer!r}")
+        pairs, ties, sources = list[tuple[int, int]](), list[tuple[int, int]](), list[Source]()
+        for pair, source in zip((*self.pairs, *self.ties), self.rows(), strict=True):
+            if source.answerer != answerer:
+                left = ties if source.tied else pairs
+                sources.append(source._replace(number=len(left)))
+                left.append(pair)
+        answers = sum(source.side != 0 for source in sources)  # what was asked has a side
+        return replace(self, pairs=tuple(pairs), ties=tuple(ties), answers=answers, sources=tuple(sources))
 
     def _with_sources(
         self, before: "Preferences", asked: tuple[int, int], shown_first: int | None, answerer: str | None
