@@ -1,4 +1,4 @@
-"""The command line: `bayespbrl run`, `resume`, `report`, `trials`."""
+"""The command line: `bayespbrl run`, `resume`, `ask`, `report`, `trials`."""
 
 import inspect
 import sys
@@ -9,8 +9,18 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from bayespbrl import checks, runs
-from bayespbrl.cli.display import PICTURE, console, progress_bar, run_to_the_end, show_run, show_trials
+from bayespbrl.cli.display import (
+    PICTURE,
+    ask_on_page,
+    check_page_installed,
+    console,
+    progress_bar,
+    run_to_the_end,
+    show_run,
+    show_trials,
+)
 from bayespbrl.runs.directory import fresh_directory
+from bayespbrl.runs.lock import continuing
 from bayespbrl.settings import OPTIONS, PARTS, Settings
 from bayespbrl.studies import run_trials
 
@@ -55,7 +65,7 @@ RUN_OPTIONS = {
     "policy": "Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.",
     "centres": "Number of radial basis functions of each kind of feature.",
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
-    "expert": "Who answers: return (simulated) or terminal (you).",
+    "expert": "Who answers: return (simulated), page (you, in a browser) or terminal (you, at the prompt).",
 }
 
 
@@ -83,20 +93,44 @@ def run(
     """Learn a task from preferences; the run is kept in a directory."""
     _check_expert(options.get("expert"))
     directory = out or fresh_directory(env)
-    run_to_the_end(runs.start(env, directory, seed=seed, **options), directory)
+    learner = runs.start(env, directory, seed=seed, **options)
+    with continuing(directory):
+        run_to_the_end(learner, directory)
 
 
 @app.command()
 def resume(directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")]) -> None:
     """Continue an interrupted run; no answer is asked for twice."""
-    learner = runs.resume(directory)
-    if not learner.finished:
-        _check_expert(learner.settings.expert)
-        run_to_the_end(learner, directory)
-    elif not (directory / PICTURE).exists():  # interrupted before it was drawn, or run in Python
-        show_run(learner, directory)
-    else:
-        console.print(f"{directory}: this run is finished; there is nothing left to do.")
+    with continuing(directory):
+        learner = runs.resume(directory)
+        if not learner.finished:
+            _check_expert(learner.settings.expert)
+            run_to_the_end(learner, directory)
+        elif not (directory / PICTURE).exists():  # interrupted before it was drawn, or run in Python
+            show_run(learner, directory)
+        else:
+            console.print(f"{directory}: this run is finished; there is nothing left to do.")
+
+
+@app.command()
+def ask(
+    directory: Annotated[Path, typer.Argument(help="Directory of a run that a person answers.")],
+    *,
+    answers: Annotated[int | None, typer.Option(help="Most answers of this sitting.")] = None,
+    answerer: Annotated[str | None, typer.Option(help="Name of who answers, kept beside the answers.")] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on; a free one if omitted.")] = 0,
+) -> None:
+    """Ask a person the questions of a run on a page in the browser; repeat the command to go on later."""
+    with continuing(directory):
+        learner = runs.resume(directory)
+        if learner.finished:
+            raise ValueError(f"{directory}: this run is finished; there is nothing left to ask")
+        if learner.settings.expert == "return":
+            raise ValueError(
+                f"expert: expected a run that a person answers, got return, the simulated one: {directory}"
+            )
+        ask_on_page(learner, directory, answers=answers, answerer=answerer, host=host, port=port)
 
 
 @app.command()
@@ -155,9 +189,11 @@ def main() -> None:
 
 
 def _check_expert(name: str | None) -> None:
-    """Refuse a run with an expert of the user's own, who cannot answer on the command line."""
+    """Refuse an expert of the user's own, who cannot answer on the command line, and a page without what it needs."""
     if name == "other":
-        raise ValueError("expert: expected return or terminal, got other; continue in Python with Learner.run")
+        raise ValueError("expert: expected return, page or terminal, got other; continue in Python with Learner.run")
+    if name == "page":
+        check_page_installed()
 
 
 def _print_error(message: str) -> int:
