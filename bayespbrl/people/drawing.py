@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 
+from bayespbrl.envs import acrobot
 from bayespbrl.envs.bicycle import FALL_ANGLE
 from bayespbrl.envs.opening import environment_attribute
 
@@ -108,7 +109,12 @@ def _bicycle(observation: Any) -> list[Stroke]:
     ]
 
 
+def _double_pendulum(observation: Any) -> list[Stroke]:
+    return [line((-1, 0.5), (1, 0.5), colour=GREEN, width=0.015), *limbs(acrobot.DYNAMICS.pose)(observation)]
+
+
 SCENES: dict[str, Scene] = {
+    "bayespbrl/Acrobot-v0": _double_pendulum,
     "bayespbrl/Bicycle-v0": _bicycle,
     "CartPole-v0": _cart_pole,
     "CartPole-v1": _cart_pole,

@@ -111,7 +111,7 @@ class Page:
             Route("/events", self._events),
             Route("/clip/{turn:int}/{side:int}", self._clip),
             Route("/answer", self._answer, methods=["POST"]),
-            Route("/{name}", self._file),
+            *(Route(f"/{name}", self._file) for name in KINDS),
         ]
         return Starlette(routes=routes, middleware=[Middleware(Guard, token=self.token, host=self.host)])
 
@@ -119,9 +119,7 @@ class Page:
         return Response(SHELL, media_type="text/html", headers=HEADERS)
 
     async def _file(self, request: Request) -> Response:
-        name = request.path_params["name"]
-        if name not in KINDS:
-            return PlainTextResponse("not found", 404)
+        name = request.url.path.rpartition("/")[2]
         content = files("bayespbrl.people").joinpath(name).read_text()
         return Response(content, media_type=KINDS[name], headers=HEADERS)
 
