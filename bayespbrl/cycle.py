@@ -51,6 +51,14 @@ class Cycle:
     schedule: schedules.Schedule
     query_rule: queries.QueryRule
 
+    def next(self, state: LearnerState) -> Entry | None:
+        """What happens next without an answer; None where a question waits for one, or the run is finished."""
+        if state.query is not None or state.finished(self.settings):
+            return None
+        if not state.collected:
+            return self.collect(state)
+        return self.show(state) if state.wanted and state.candidates else self.improve(state)
+
     def collect(self, state: LearnerState) -> Entry:
         """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
         options, questions = self.settings.rollouts, self.settings.questions
@@ -62,7 +70,7 @@ class Cycle:
             episodes=options.trajectories_per_iteration,
             max_steps=options.max_steps,
             hold=options.exploration_hold,
-            starts=self._starts(state) if questions.same_start else None,
+            starts=self._starts(state.iteration) if questions.same_start else None,
         )
         chosen = self._chosen_questions(state, (*state.trajectories, *collected))
         event = {
@@ -91,11 +99,18 @@ class Cycle:
         each = self.settings.rollouts.trajectories_per_iteration
         return range(number * each, (number + 1) * each)
 
-    def _starts(self, state: LearnerState) -> list[int]:
+    def _starts(self, iteration: int) -> list[int]:
         """The seeds of the resets, the same in each iteration; in the first each start has two trajectories."""
         number = self.settings.rollouts.trajectories_per_iteration
         first = int(self._rng(STARTS, 0).integers(2**30))
-        return [first + (i // 2 if state.iteration == 0 else i) for i in range(number)]
+        return [first + (i // 2 if iteration == 0 else i) for i in range(number)]
+
+    def reset_seed(self, number: int) -> int:
+        """The seed with which the environment was reset for a trajectory, where it is stepped by its interface."""
+        iteration, episode = divmod(number, self.settings.rollouts.trajectories_per_iteration)
+        if self.settings.questions.same_start:
+            return self._starts(iteration)[episode]
+        return rollouts.reset_seed(self._key(COLLECT, iteration)) + episode
 
     def show(self, state: LearnerState) -> Entry:
         """Step 4: the next question, the best candidate against its opponent, or a repeated one; `asked`."""

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -19,6 +19,9 @@ from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same
 from bayespbrl.settings import Settings, Task, settings_for
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
+
+if TYPE_CHECKING:
+    from bayespbrl.people.widget import ComparisonWidget
 
 
 class Learner:
@@ -188,7 +191,7 @@ class Learner:
             if answer is Answer.UNDO:
                 self.undo()
             else:
-                self._record(entry)
+                self.record(entry)
 
     def undo(self) -> None:
         """Take the last answer back, and what followed from it; its question waits again.
@@ -196,7 +199,7 @@ class Learner:
         Raises:
           ValueError: nothing has been answered yet.
         """
-        self._record(Entry({"event": "undone"}))
+        self.record(Entry({"event": "undone"}))
 
     def run(
         self,
@@ -223,23 +226,41 @@ class Learner:
             self._advance(progress)
         return self
 
+    def widget(self, *, answers: int | None = None, answerer: str | None = None) -> "ComparisonWidget":
+        """What asks a person the questions in a notebook; needs the extra `people`.
+
+        Answers are told and questions asked in the background: cells stay free. `widget.close()` ends it; until then
+        the learner must not be told anything else.
+
+        Args:
+          answers: most answers of this sitting; None: as many as the run takes.
+          answerer: the person's name, kept beside the answers.
+
+        Raises:
+          ValueError: the extra is not installed; a bad number or name; a finished run.
+        """
+        try:
+            from bayespbrl.people.widget import ComparisonWidget  # here, since people stand above the learner
+        except ImportError as error:
+            raise ValueError(f"the widget needs the extra people: pip install 'bayespbrl[people]' ({error})") from error
+        return ComparisonWidget(self, most_answers=answers, answerer=answerer)
+
     def _waiting(self) -> list[Query]:
         return [] if self.state.query is None else [self.state.query]
 
     def _advance(self, progress: Callable[["Learner"], None] | None = None) -> None:
         """Do what can be done without an answer; `progress` is called after each iteration."""
-        while self.state.query is None and not self.finished:
-            if not self.state.collected:
-                self._record(self.cycle.collect(self.state))
-            elif self.state.wanted and self.state.candidates:
-                self._record(self.cycle.show(self.state))
-            else:
-                self._record(self.cycle.improve(self.state))
-                if progress is not None:
-                    progress(self)
+        while (entry := self.cycle.next(self.state)) is not None:
+            self.record(entry)
+            if progress is not None and entry.event["event"] == "improved":
+                progress(self)
 
-    def _record(self, entry: Entry) -> None:
-        """Append to the log first, then move on: what the learner knows is never ahead of what is kept."""
+    def record(self, entry: Entry) -> None:
+        """Append an event to the log first, then move on: what the learner knows is never ahead of what is kept.
+
+        Raises:
+          ValueError: an event that cannot follow; nothing has happened then.
+        """
         state = events.apply(self.state, entry)
         if self.log is not None:
             self.log.append(entry, state)

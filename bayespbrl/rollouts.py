@@ -122,6 +122,14 @@ def returns(
     return Returns(total, steps, terminated)
 
 
+def reset_seed(key: Key[Array, ""]) -> int:
+    """The seed of the first episode's reset where a rollout with `key` steps the gymnasium interface.
+
+    The other episodes' count up from it, but for environments with a vector version of their own.
+    """
+    return int(jax.random.randint(jax.random.split(key)[0], (), 0, 2**30))
+
+
 def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int:
     """The time limit that holds: `max_steps`, else the `TimeLimit` wrapper's, else the spec's, else the dynamics'."""
     env = open_environment(environment)
@@ -305,8 +313,7 @@ def _by_interface(
     hold: int = 1,
     starts: Sequence[int] | None = None,
 ) -> Iterator[Trajectory]:
-    seed_key, policy_key = jax.random.split(key)
-    first_seed = int(jax.random.randint(seed_key, (), 0, 2**30))
+    policy_key = jax.random.split(key)[1]
     choose = _act if _is_pytree(policy) else _act_one_by_one
 
     def act(counter: int, observations: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, "n ..."]:
@@ -317,7 +324,7 @@ def _by_interface(
         return actions
 
     time_limit = steps if explicit else None
-    seeds = first_seed if starts is None else starts
+    seeds = reset_seed(key) if starts is None else starts
     for states, actions, rewards, terminated in episodes_by_interface(
         env, act, seeds=seeds, episodes=episodes, steps=steps, time_limit=time_limit
     ):

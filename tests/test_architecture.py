@@ -28,6 +28,7 @@ ROOMS = {
     "events": ["events"],
     "learner": ["learner", "cycle"],
     "runs": ["runs"],
+    "people": ["people"],
     "studies": ["studies"],
     "diagnostics": ["diagnostics"],
     "report": ["diagnostics.report"],
@@ -48,13 +49,14 @@ BELOW = {
     "events": [*FLOWS, *STEPS, "settings"],
     "learner": LEARNED,
     "runs": LEARNED,
+    "people": [*LEARNED, "runs"],
     "studies": [*LEARNED, "runs"],
     "diagnostics": LEARNED,
     "report": [*LEARNED, "runs", "diagnostics"],
-    "command line": [*LEARNED, "runs", "studies", "diagnostics", "report"],
+    "command line": [*LEARNED, "runs", "people", "studies", "diagnostics", "report"],
 }
-# `Run.report` imports the report, which stands above it, when it is called.
-DOORS = {("runs.run", "diagnostics.report")}
+# `Run.report` and `Learner.widget` import what stands above them when they are called.
+DOORS = {("runs.run", "diagnostics.report"), ("learner", "people.widget")}
 
 
 def floor_of(module):
@@ -128,7 +130,7 @@ def test_no_imports_go_round_in_circles():
 def test_the_steps_never_import_each_other_and_only_the_learner_orders_them():
     steps = {module: {floor_of(other) for other in ours(module)} & set(STEPS) for module in INNER}
     assert [module for module in INNER if floor_of(module) in STEPS and steps[module] - {floor_of(module)}] == []
-    above = ("learner", "runs", "studies", "diagnostics", "report", "command line")
+    above = ("learner", "runs", "people", "studies", "diagnostics", "report", "command line")
     assert [module for module in INNER if steps[module] >= set(STEPS) and floor_of(module) not in above] == []
 
 

@@ -1,4 +1,4 @@
-"""The command line: `bayespbrl run`, `resume`, `report`, `trials`."""
+"""The command line: `bayespbrl run`, `resume`, `ask`, `report`, `trials`."""
 
 from bayespbrl.cli.commands import main
 

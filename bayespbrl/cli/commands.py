@@ -1,4 +1,4 @@
-"""The command line: `bayespbrl run`, `resume`, `report`, `trials`."""
+"""The command line: `bayespbrl run`, `resume`, `ask`, `report`, `trials`."""
 
 import inspect
 import sys
@@ -9,8 +9,18 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from bayespbrl import checks, runs
-from bayespbrl.cli.display import PICTURE, console, progress_bar, run_to_the_end, show_run, show_trials
+from bayespbrl.cli.display import (
+    PICTURE,
+    ask_on_page,
+    check_page_installed,
+    console,
+    progress_bar,
+    run_to_the_end,
+    show_run,
+    show_trials,
+)
 from bayespbrl.runs.directory import fresh_directory
+from bayespbrl.runs.lock import continuing
 from bayespbrl.settings import OPTIONS, PARTS, Settings
 from bayespbrl.studies import run_trials
 
@@ -23,7 +33,7 @@ app = typer.Typer(
 
 Answerer = Annotated[
     str | None,
-    typer.Option(help="Your name or a pseudonym, with --expert terminal; it is kept with each answer and its time."),
+    typer.Option(help="Name or pseudonym of the person who answers; it is kept with each answer and its time."),
 ]
 Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot, or any gymnasium id.")]
 
@@ -61,7 +71,7 @@ RUN_OPTIONS = {
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
     "repeats": "Share of the questions that are an earlier one with sides swapped, which shows how consistent a person "
     "is; 0.1 for people, 0 for a simulated expert.",
-    "expert": "Who answers: return (simulated) or terminal (you).",
+    "expert": "Who answers: return (simulated), page (you, in a browser) or terminal (you, at the prompt).",
 }
 
 
@@ -90,7 +100,9 @@ def run(
     """Learn a task from preferences; the run is kept in a directory."""
     _check_expert(options.get("expert"), answerer)
     directory = out or fresh_directory(env)
-    run_to_the_end(runs.start(env, directory, seed=seed, **options), directory, answerer=answerer)
+    learner = runs.start(env, directory, seed=seed, **options)
+    with continuing(directory):
+        run_to_the_end(learner, directory, answerer=answerer)
 
 
 @app.command()
@@ -98,14 +110,36 @@ def resume(
     directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")], *, answerer: Answerer = None
 ) -> None:
     """Continue an interrupted run; no answer is asked for twice."""
-    learner = runs.resume(directory)
-    if not learner.finished:
-        _check_expert(learner.settings.expert, answerer)
-        run_to_the_end(learner, directory, answerer=answerer)
-    elif not (directory / PICTURE).exists():  # interrupted before it was drawn, or run in Python
-        show_run(learner, directory)
-    else:
-        console.print(f"{directory}: this run is finished; there is nothing left to do.")
+    with continuing(directory):
+        learner = runs.resume(directory)
+        if not learner.finished:
+            _check_expert(learner.settings.expert, answerer)
+            run_to_the_end(learner, directory, answerer=answerer)
+        elif not (directory / PICTURE).exists():  # interrupted before it was drawn, or run in Python
+            show_run(learner, directory)
+        else:
+            console.print(f"{directory}: this run is finished; there is nothing left to do.")
+
+
+@app.command()
+def ask(
+    directory: Annotated[Path, typer.Argument(help="Directory of a run that a person answers.")],
+    *,
+    answers: Annotated[int | None, typer.Option(help="Most answers of this sitting.")] = None,
+    answerer: Answerer = None,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on; a free one if omitted.")] = 0,
+) -> None:
+    """Ask a person the questions of a run on a page in the browser; repeat the command to go on later."""
+    with continuing(directory):
+        learner = runs.resume(directory)
+        if learner.finished:
+            raise ValueError(f"{directory}: this run is finished; there is nothing left to ask")
+        if learner.settings.expert == "return":
+            raise ValueError(
+                f"expert: expected a run that a person answers, got return, the simulated one: {directory}"
+            )
+        ask_on_page(learner, directory, answers=answers, answerer=answerer, host=host, port=port)
 
 
 @app.command()
@@ -164,13 +198,15 @@ def main() -> None:
 
 
 def _check_expert(name: str | None, answerer: str | None) -> None:
-    """Refuse an expert of the user's own, who cannot answer on the command line, and a name for a simulated one."""
+    """Refuse an expert of the user's own, a name for a simulated one, and a page without what it needs."""
     if answerer is not None:
         checks.short_name("answerer", answerer)
-        if name != "terminal":
-            raise ValueError(f"answerer: expected a name with the expert terminal alone, got {answerer!r}")
+        if name not in ("terminal", "page"):
+            raise ValueError(f"answerer: expected a name with a person who answers (terminal, page), got {answerer!r}")
     if name == "other":
-        raise ValueError("expert: expected return or terminal, got other; continue in Python with Learner.run")
+        raise ValueError("expert: expected return, page or terminal, got other; continue in Python with Learner.run")
+    if name == "page":
+        check_page_installed()
 
 
 def _print_error(message: str) -> int:

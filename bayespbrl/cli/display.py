@@ -22,8 +22,10 @@ PICTURE = "run.png"
 def run_to_the_end(learner: Learner, directory: Path, *, answerer: str | None = None) -> None:
     """Run a learner that keeps its events in `directory` to its end, with its progress, then `show_run`.
 
-    `answerer` is the name of the person at the terminal.
+    `answerer` is the name of the person who answers.
     """
+    if learner.settings.expert == "page":
+        return ask_on_page(learner, directory, answerer=answerer)
     console.print(f"Run directory: {directory}")
     try:
         if learner.settings.expert == "terminal":
@@ -35,6 +37,55 @@ def run_to_the_end(learner: Learner, directory: Path, *, answerer: str | None = 
         console.print(f"\nStopped. Nothing is lost: bayespbrl resume {directory}")
         raise
     show_run(learner, directory)
+
+
+def ask_on_page(
+    learner: Learner,
+    directory: Path,
+    *,
+    answers: int | None = None,
+    answerer: str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 0,
+) -> None:
+    """Ask a person the questions of a run on a page, until it is finished or the person stops.
+
+    Args:
+      learner: keeps its events in `directory`.
+      answers: most answers of this sitting.
+      answerer: the person's name, kept beside the answers.
+      host, port: of the page; port 0 for a free one.
+
+    Raises:
+      ValueError: the extra is not installed, or the port is in use.
+    """
+    check_page_installed()
+    from bayespbrl.people.page import Page
+    from bayespbrl.people.session import Session
+
+    page = Page(Session(learner, most_answers=answers, answerer=answerer), host=host, port=port)
+    console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:\n{page.address}")
+    try:
+        page.serve()
+    except KeyboardInterrupt:
+        console.print(f"\nStopped. Nothing is lost: bayespbrl ask {directory}")
+        raise
+    view = page.session.view
+    if view["phase"] == "failed":
+        raise ValueError(view["say"])
+    console.print(view["say"])
+    if learner.finished:
+        show_run(learner, directory)
+    else:
+        console.print(f"The same command goes on: bayespbrl ask {directory}")
+
+
+def check_page_installed() -> None:
+    """`ValueError` where the extra `people` is not installed."""
+    try:
+        from bayespbrl.people import page  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"the page needs the extra people: pip install 'bayespbrl[people]' ({error})") from error
 
 
 def show_run(learner: Learner, directory: Path) -> None:

@@ -51,18 +51,18 @@ def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tu
 
 def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
     """Pictures of one episode that the environment renders, and the milliseconds for which to show each."""
-    env, settings = _rendering(learner.environment), learner.settings
+    env, settings = rendering(learner.environment), learner.settings
     limit = rollouts.step_limit(learner.environment, settings.rollouts.max_steps)
     actor = Actor(learner.policy, env.action_space, np.random.default_rng(settings.seed))
     stride = 1
     try:
         observation, _ = env.reset(seed=settings.seed)
-        frames = [_frame(env)]
+        frames = [rendered_frame(env)]
         for step in range(1, limit + 1):
             observation, _, terminated, truncated, _ = env.step(actor.act(observation))
             ended = terminated or truncated or step == limit
             if ended or step % stride == 0:
-                frames.append(_frame(env))
+                frames.append(rendered_frame(env))
             if ended:
                 break
             if len(frames) == 2 * FRAMES:  # bounds the memory of a long episode
@@ -73,8 +73,12 @@ def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
     return np.stack(frames), 1000 * stride / float(env.metadata.get("render_fps") or 10)
 
 
-def _rendering(environment: gymnasium.Env) -> gymnasium.Env:
-    """The environment in a mode that renders: made again where its id was given, else the user's object."""
+def rendering(environment: gymnasium.Env) -> gymnasium.Env:
+    """The environment in a mode that renders: made again where its id was given, else the user's object.
+
+    Raises:
+      ValueError: it has no mode `rgb_array`, or is an object in another mode.
+    """
     spec = made_from(environment)
     if spec is None:
         if environment.render_mode != "rgb_array":
@@ -86,7 +90,8 @@ def _rendering(environment: gymnasium.Env) -> gymnasium.Env:
     return flattened(gymnasium.make(spec, render_mode="rgb_array"))
 
 
-def _frame(env: gymnasium.Env) -> np.ndarray:
+def rendered_frame(env: gymnasium.Env) -> np.ndarray:
+    """The environment's picture of its state, shape (height, width, 3) uint8; `ValueError` where it gives another."""
     frame = np.asarray(env.render())
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise ValueError(f"expected a picture of shape (height, width, 3) in uint8, got {frame.shape} in {frame.dtype}")

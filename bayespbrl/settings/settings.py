@@ -132,7 +132,7 @@ class Settings:
         elif self.questions.answers is None:
             raise ValueError("iterations: expected a number without a budget of answers, got None")
         checks.one_of("environment", self.environment, ("named", "other"))
-        checks.one_of("expert", self.expert, ("return", "terminal", "other"))
+        checks.one_of("expert", self.expert, ("return", "terminal", "page", "other"))
         checks.share("wrong_answers", self.wrong_answers)
         self._check_together()
 

@@ -1,0 +1,272 @@
+// The front end of the page and of the notebook's widget: two clips in step, a question, keys and buttons.
+//
+// `model` is anywidget's: get(name), send(message), on(event, callback), off(event, callback).
+//   view           what to show: {phase, turn, task, answered, budget, clips, rate, worth, sure, undo, say}
+//   first, second  the sprite sheets of the two clips, bytes
+//   whole_page     whether keys count wherever the focus is
+// It sends {turn, answer, seconds} and hears, as "msg:custom", {refused: turn, say} and {connection: "lost" | "back"}.
+// A turn is answered at most once: after an answer everything is locked until the next turn or a refusal.
+
+const KEYS = {
+  ArrowLeft: "first", ArrowRight: "second", ArrowDown: "tie", t: "tie", T: "tie", s: "skip", S: "skip", u: "undo", U: "undo",
+};
+const SAID = { first: "First is better", second: "Second is better", tie: "No difference", skip: "Skipped", undo: "Taken back" };
+const REST = 0.8; // seconds on the last picture before the clips start again
+
+const HTML = `
+<div class="bp-box" tabindex="0" role="region" aria-label="Compare two clips" data-lm-suppress-shortcuts="true">
+  <header>
+    <span class="bp-task"></span>
+    <span class="bp-count"></span>
+    <progress class="bp-progress" max="1" value="0" aria-label="Answers given"></progress>
+  </header>
+  <h2 class="bp-ask">Which one is better?</h2>
+  <div class="bp-clips">
+    <figure>
+      <canvas role="img" width="320" height="320"></canvas>
+      <figcaption></figcaption>
+      <button type="button" class="bp-choice" data-answer="first"><kbd>←</kbd><span>First is better</span></button>
+    </figure>
+    <figure>
+      <canvas role="img" width="320" height="320"></canvas>
+      <figcaption></figcaption>
+      <button type="button" class="bp-choice" data-answer="second"><span>Second is better</span><kbd>→</kbd></button>
+    </figure>
+  </div>
+  <div class="bp-film" role="group" aria-label="Playback">
+    <button type="button" class="bp-play" aria-label="Pause" title="Pause or play (space)"></button>
+    <button type="button" class="bp-again" aria-label="From the start" title="From the start"></button>
+    <input class="bp-scrub" type="range" min="0" max="1000" value="0" step="1" aria-label="Time">
+    <output class="bp-step"></output>
+    <label class="bp-speed">Speed <select aria-label="Speed">
+      <option value="0.5">0.5 ×</option><option value="1" selected>1 ×</option>
+      <option value="2">2 ×</option><option value="4">4 ×</option></select></label>
+  </div>
+  <div class="bp-rest">
+    <button type="button" data-answer="tie"><span>No difference</span><kbd>↓</kbd></button>
+    <button type="button" data-answer="skip"><span>Cannot tell</span><kbd>S</kbd></button>
+    <button type="button" data-answer="undo"><span>Undo</span><kbd>U</kbd></button>
+  </div>
+  <p class="bp-learner"></p>
+  <p class="bp-note" hidden></p>
+  <p class="bp-live" role="status" aria-live="polite"></p>
+</div>`;
+
+const bytes = (value) => (value instanceof DataView ? new Uint8Array(value.buffer, value.byteOffset, value.byteLength) : value);
+
+// One clock for both clips, in steps of the environment: they cannot drift apart.
+class Film {
+  constructor(box) {
+    this.box = box;
+    this.canvases = [...box.querySelectorAll("canvas")];
+    this.scrub = box.querySelector(".bp-scrub");
+    this.step = box.querySelector(".bp-step");
+    this.button = box.querySelector(".bp-play");
+    this.speed = 1;
+    this.clips = [];
+    this.at = 0;
+    this.play(!matchMedia("(prefers-reduced-motion: reduce)").matches);
+  }
+
+  load(clips, sheets, rate) {
+    for (const sheet of this.sheets ?? []) sheet.close();
+    Object.assign(this, { clips, sheets, rate, at: 0, longest: Math.max(...clips.map((clip) => clip.steps)) });
+    this.canvases.forEach((canvas, k) => {
+      canvas.width = clips[k].width;
+      canvas.height = clips[k].height;
+      canvas.dataset.frame = "";
+    });
+    this.draw();
+  }
+
+  play(playing) {
+    this.playing = playing;
+    this.button.dataset.playing = playing;
+    this.button.setAttribute("aria-label", playing ? "Pause" : "Play");
+  }
+
+  move(at) {
+    this.at = Math.max(0, Math.min(at, this.longest));
+    this.draw();
+  }
+
+  tick(now) {
+    const seconds = Math.min(0.25, (now - (this.last ?? now)) / 1000);
+    this.last = now;
+    if (!this.playing || !this.clips.length) return;
+    this.at += seconds * this.rate * this.speed;
+    if (this.at > this.longest + REST * this.rate * this.speed) this.at = 0;
+    this.draw();
+  }
+
+  draw() {
+    const at = Math.min(this.at, this.longest);
+    this.canvases.forEach((canvas, k) => {
+      const { frames, columns, width, height, steps } = this.clips[k];
+      const frame = Math.round((Math.min(at, steps) / steps) * (frames - 1));
+      if (canvas.dataset.frame === String(frame)) return;
+      const pen = canvas.getContext("2d");
+      pen.clearRect(0, 0, width, height);
+      const [x, y] = [(frame % columns) * width, Math.floor(frame / columns) * height];
+      pen.drawImage(this.sheets[k], x, y, width, height, 0, 0, width, height);
+      canvas.dataset.frame = frame;
+      canvas.dataset.step = (frame / Math.max(1, frames - 1)) * steps;
+    });
+    const text = `step ${Math.round(at)} of ${this.longest}`;
+    if (this.step.value === text) return;
+    this.step.value = text;
+    this.scrub.value = Math.round((1000 * at) / this.longest);
+    this.scrub.setAttribute("aria-valuetext", text);
+  }
+}
+
+function caption(clip, name) {
+  return `${name}: ${clip.steps} steps${clip.ended ? ", then it ended" : ""}`;
+}
+
+// What the learner says about the question, without a hint at either side.
+function learnerText({ worth, sure, advice }) {
+  const parts = [];
+  if (sure !== null && sure !== undefined) parts.push(`The learner is ${Math.round(100 * sure)} % sure what you will say.`);
+  if (worth !== null && worth !== undefined) parts.push(`Your answer is worth about ${worth.toFixed(2)} bit, of 1 at most.`);
+  if (advice) parts.push(advice);
+  return parts.join(" ");
+}
+
+function render({ model, el }) {
+  const root = document.createElement("div");
+  root.className = model.get("whole_page") ? "bayespbrl bp-page" : "bayespbrl";
+  root.innerHTML = HTML;
+  el.append(root);
+  const find = (name) => root.querySelector(name);
+  const [box, ask, note, live] = [".bp-box", ".bp-ask", ".bp-note", ".bp-live"].map(find);
+  const film = new Film(box);
+  let view = {}, alive = true, locked = true, answered = null, shown = 0, loads = 0, loaded = null, slow;
+
+  function lock(yes) {
+    locked = yes;
+    box.dataset.locked = yes;
+    for (const button of root.querySelectorAll("[data-answer]")) {
+      const off = yes || (button.dataset.answer === "undo" && !view.undo);
+      button.setAttribute("aria-disabled", off);
+    }
+  }
+
+  function say(text, aloud = text) {
+    ask.textContent = text;
+    if (aloud) live.textContent = aloud;
+  }
+
+  function warn(text) {
+    note.textContent = text ?? "";
+    note.hidden = !text;
+  }
+
+  function progress() {
+    const { answered: done = 0, budget, task = "" } = view;
+    find(".bp-task").textContent = task;
+    find(".bp-count").textContent = budget ? `${done} of at most ${budget} answers` : `${done} answers`;
+    const bar = find(".bp-progress");
+    bar.hidden = !budget;
+    bar.value = budget ? done / budget : 0;
+  }
+
+  async function take() {
+    view = model.get("view") ?? {};
+    box.dataset.phase = view.phase ?? "thinking";
+    progress();
+    if (view.turn !== answered) clearTimeout(slow);
+    if (view.phase !== "question") {
+      lock(true);
+      find(".bp-learner").textContent = "";
+      say(view.phase === "thinking" || !view.phase ? "Thinking…" : view.say);
+      return;
+    }
+    if (loaded !== view.turn) {
+      const load = ++loads;
+      const sheets = await Promise.all(["first", "second"].map((name) => createImageBitmap(new Blob([bytes(model.get(name))]))));
+      if (load !== loads || !alive) return;
+      film.load(view.clips, sheets, view.rate);
+      loaded = view.turn;
+      shown = performance.now();
+    }
+    film.canvases.forEach((canvas, k) => {
+      const text = caption(view.clips[k], ["First", "Second"][k]);
+      canvas.setAttribute("aria-label", text);
+      canvas.nextElementSibling.textContent = text;
+    });
+    find(".bp-learner").textContent = learnerText(view);
+    if (view.turn === answered) return; // the answer is on its way
+    lock(false);
+    box.dataset.turn = view.turn;
+    say("Which one is better?", `Question ${view.answered + 1}. Which one is better? Left arrow: first. Right arrow: second.`);
+    if (root.contains(document.activeElement) || model.get("whole_page")) box.focus({ preventScroll: true });
+  }
+
+  function answer(which) {
+    if (locked || (which === "undo" && !view.undo)) return;
+    lock(true);
+    answered = view.turn;
+    warn(null);
+    live.textContent = SAID[which];
+    slow = setTimeout(() => { box.dataset.phase = "thinking"; say("Thinking…"); }, 150);
+    model.send({ turn: view.turn, answer: which, seconds: (performance.now() - shown) / 1000 });
+  }
+
+  function hear(message) {
+    if (message.connection === "lost") warn("The connection is lost. Trying again…");
+    if (message.connection === "gone") { lock(true); warn(message.say); }
+    if (message.connection === "back") warn(null);
+    if (message.refused === undefined || message.refused !== answered) return;
+    answered = null;
+    clearTimeout(slow);
+    take().then(() => warn(message.say));
+  }
+
+  function key(event) {
+    const { target } = event;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const moves = target.matches?.("input, select") && !["t", "T", "s", "S", "u", "U"].includes(event.key);
+    const presses = target.matches?.("button") && [" ", "Enter"].includes(event.key);
+    if (moves || presses) return event.stopPropagation();
+    if (event.key !== " " && !(event.key in KEYS)) return;
+    event.preventDefault();
+    event.stopPropagation();
+    if (event.repeat) return;
+    if (event.key === " ") film.play(!film.playing);
+    else answer(KEYS[event.key]);
+  }
+
+  const keys = model.get("whole_page") ? window : box;
+  keys.addEventListener("keydown", key);
+  root.addEventListener("click", ({ target }) => {
+    const button = target.closest("[data-answer]");
+    if (button) answer(button.dataset.answer);
+  });
+  film.button.addEventListener("click", () => film.play(!film.playing));
+  find(".bp-again").addEventListener("click", () => film.clips.length && film.move(0));
+  find(".bp-speed select").addEventListener("change", ({ target }) => { film.speed = Number(target.value); });
+  film.scrub.addEventListener("input", () => {
+    film.play(false);
+    if (film.clips.length) film.move((film.scrub.value / 1000) * film.longest);
+  });
+
+  (function paint(now) {
+    if (!alive) return;
+    film.tick(now);
+    requestAnimationFrame(paint);
+  })(performance.now());
+  model.on("change:view", take);
+  model.on("msg:custom", hear);
+  lock(true);
+  take();
+  return () => {
+    alive = false;
+    clearTimeout(slow);
+    keys.removeEventListener("keydown", key);
+    model.off("change:view", take);
+    model.off("msg:custom", hear);
+  };
+}
+
+export default { render };

@@ -1,0 +1,86 @@
+// The page as a host of the front end: a model with anywidget's interface over fetch and server-sent events.
+import front from "./front.js";
+
+const state = { view: {}, whole_page: true };
+const listeners = {};
+const fire = (event, message) => (listeners[event] ?? []).forEach((callback) => callback(message));
+const pause = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
+const GONE = "The program behind this page has ended. Start it again and open the address that it prints.";
+const PATIENCE = 20; // seconds without a server until the page stops trying
+
+const model = {
+  get: (name) => state[name],
+  on: (event, callback) => (listeners[event] ??= []).push(callback),
+  off: (event, callback) => { listeners[event] = (listeners[event] ?? []).filter((known) => known !== callback); },
+  send: (message) => post(message),
+};
+
+// Sent again until the server has heard it; the server takes each turn once.
+async function post(message) {
+  for (;;) {
+    try {
+      const reply = await fetch("answer", {
+        method: "POST",
+        headers: { "Content-Type": "application/json" },
+        body: JSON.stringify(message),
+      });
+      if (!reply.ok) fire("msg:custom", { refused: message.turn, say: reply.status === 409 ? null : await reply.text() });
+      return;
+    } catch {
+      fire("msg:custom", { connection: "lost" });
+      if (ended()) return;
+      await pause(500);
+    }
+  }
+}
+
+let fetched = null; // the turn whose clips are here
+let newest = 0;
+
+async function take(view) {
+  const mine = ++newest;
+  if (view.phase === "question" && view.turn !== fetched) {
+    try {
+      const sheets = await Promise.all([0, 1].map(async (side) => {
+        const reply = await fetch(`clip/${view.turn}/${side}`);
+        if (!reply.ok) throw new Error(reply.statusText);
+        return new Uint8Array(await reply.arrayBuffer());
+      }));
+      if (mine !== newest) return;
+      [state.first, state.second] = sheets;
+      fetched = view.turn;
+    } catch {
+      if (mine !== newest) return;
+      await pause(500); // the next view may be here by then
+      if (mine === newest && !ended()) await take(view);
+      return;
+    }
+  }
+  if (mine !== newest) return;
+  state.view = view;
+  fire("change:view");
+}
+
+let source, lost = null;
+const over = () => ["finished", "failed"].includes(state.view.phase);
+const ended = () => over() || (lost !== null && performance.now() - lost > 1000 * PATIENCE);
+
+function listen() {
+  source = new EventSource("events");
+  source.onmessage = (event) => take(JSON.parse(event.data));
+  source.onopen = () => {
+    if (lost !== null) fire("msg:custom", { connection: "back" });
+    lost = null;
+  };
+  source.onerror = async () => {
+    source.close();
+    if (over()) return;
+    lost ??= performance.now();
+    fire("msg:custom", ended() ? { connection: "gone", say: GONE } : { connection: "lost" });
+    await pause(500);
+    if (!ended()) listen();
+  };
+}
+
+front.render({ model, el: document.getElementById("front") });
+listen();

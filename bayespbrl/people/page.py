@@ -1,0 +1,218 @@
+"""The page: a small web server on one session, for a browser on this machine.
+
+The address holds a random token. Without it, from a foreign origin or under a foreign host name nothing is answered.
+The page loads nothing from elsewhere.
+"""
+
+import asyncio
+import contextlib
+import ipaddress
+import json
+import secrets
+import socket
+import threading
+from collections.abc import AsyncIterator
+from importlib.resources import files
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from bayespbrl.people.session import Session, Stale, answer_of
+
+LARGEST_BODY = 4096  # bytes
+HEARTBEAT = 10.0  # seconds between signs of life
+FAREWELL = 1.5  # seconds for the last view to arrive
+KINDS = {"front.js": "text/javascript", "host.js": "text/javascript", "front.css": "text/css"}
+SHELL = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>Which one is better?</title>
+<link rel="icon" href="data:,">
+<link rel="stylesheet" href="front.css">
+<style>body { margin: 0 } .bayespbrl { min-height: 100vh }</style>
+</head>
+<body><main id="front"></main><script type="module" src="host.js"></script></body>
+</html>
+"""
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "connect-src 'self'; img-src blob: data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+}
+
+
+class Page:
+    """A page on a free or given port, bound when this is made.
+
+    Args:
+      session: opened by `serve`.
+      host: a name or address of this machine; by default only programs on it can connect.
+      port: 0 for a free one.
+
+    Raises:
+      ValueError: a port that is in use, or an address that is not this machine's.
+    """
+
+    def __init__(self, session: Session, *, host: str = "127.0.0.1", port: int = 0):
+        self.session, self.token = session, secrets.token_urlsafe(16)
+        try:
+            family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+            self._socket = socket.create_server((host, port), family=family)
+        except (OSError, OverflowError) as error:
+            raise ValueError(f"port {port} on {host}: cannot listen there ({error})") from error
+        self.host, self.port = host, self._socket.getsockname()[1]
+        config = uvicorn.Config(
+            self._application(), log_level="warning", access_log=False, timeout_graceful_shutdown=1, lifespan="off"
+        )
+        self._server = uvicorn.Server(config)
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}/{self.token}/"
+
+    def serve(self) -> None:
+        """Answer requests until the session is over or `stop` is called; `KeyboardInterrupt` where the user stops it.
+
+        Nothing is lost then.
+        """
+        self.session.open()
+        farewell = threading.Thread(target=self._say_farewell, daemon=True)
+        farewell.start()
+        try:
+            self._server.run(sockets=[self._socket])
+        finally:
+            self.session.close()
+            self._socket.close()
+
+    def stop(self) -> None:
+        """End `serve`, from another thread."""
+        self._server.should_exit = True
+
+    def _say_farewell(self) -> None:
+        self.session.wait(("finished", "failed"))
+        threading.Event().wait(FAREWELL)
+        self.stop()
+
+    def _application(self) -> ASGIApp:
+        routes = [
+            Route("/", self._home),
+            Route("/events", self._events),
+            Route("/clip/{turn:int}/{side:int}", self._clip),
+            Route("/answer", self._answer, methods=["POST"]),
+            *(Route(f"/{name}", self._file) for name in KINDS),
+        ]
+        return Starlette(routes=routes, middleware=[Middleware(Guard, token=self.token, host=self.host)])
+
+    async def _home(self, request: Request) -> Response:
+        return Response(SHELL, media_type="text/html", headers=HEADERS)
+
+    async def _file(self, request: Request) -> Response:
+        name = request.url.path.rpartition("/")[2]
+        content = files("bayespbrl.people").joinpath(name).read_text()
+        return Response(content, media_type=KINDS[name], headers=HEADERS)
+
+    async def _clip(self, request: Request) -> Response:
+        turn, side = request.path_params["turn"], request.path_params["side"]
+        try:
+            sheet = self.session.sheet(turn, side) if side in (0, 1) else None
+        except Stale:
+            sheet = None
+        if sheet is None:
+            return PlainTextResponse("clip: expected one of the present question", 404)
+        kind = "image/png" if sheet.startswith(b"\x89PNG") else "image/jpeg"
+        return Response(sheet, media_type=kind, headers=HEADERS)
+
+    async def _answer(self, request: Request) -> Response:
+        try:
+            body = await _bounded(request)
+        except OverflowError:
+            return PlainTextResponse(f"body: expected at most {LARGEST_BODY} bytes", 413)
+        try:
+            turn, answer, seconds = answer_of(json.loads(body))
+            await asyncio.to_thread(self.session.answer, turn, answer, seconds)
+        except Stale as error:
+            return PlainTextResponse(str(error), 409)
+        except (ValueError, RecursionError) as error:
+            return PlainTextResponse(" ".join(str(error).split())[:300], 400)
+        return Response(status_code=204)
+
+    async def _events(self, request: Request) -> Response:
+        return StreamingResponse(self._views(), media_type="text/event-stream", headers=HEADERS)
+
+    async def _views(self) -> AsyncIterator[str]:
+        """Each view as a server-sent event, the present one first."""
+        loop, changed = asyncio.get_running_loop(), asyncio.Event()
+
+        def wake() -> None:
+            with contextlib.suppress(RuntimeError):  # the server has just ended
+                loop.call_soon_threadsafe(changed.set)
+
+        deaf, sent = self.session.listen(wake), None
+        try:
+            while not self._server.should_exit:
+                changed.clear()
+                view = self.session.view
+                yield ": here\n\n" if view is sent else f"data: {json.dumps(view)}\n\n"
+                sent = view
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(changed.wait(), HEARTBEAT)
+        finally:
+            deaf()
+
+
+async def _bounded(request: Request) -> bytes:
+    """The body; `OverflowError` where it is too long, without reading on."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > LARGEST_BODY:
+            raise OverflowError
+    return body
+
+
+class Guard:
+    """Lets through what has the token as the first part of its path and comes from our own page."""
+
+    def __init__(self, app: ASGIApp, *, token: str, host: str):
+        self.app, self.token, self.host = app, token, host
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        _, _, rest = scope["path"].partition("/")
+        token, slash, path = rest.partition("/")
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        if not (slash and secrets.compare_digest(token.encode(), self.token.encode()) and self._ours(headers)):
+            refusal = PlainTextResponse("expected the address that the program printed, with its token", 403)
+            await refusal(scope, receive, send)
+            return
+        await self.app({**scope, "path": f"/{path}", "raw_path": f"/{path}".encode()}, receive, send)
+
+    def _ours(self, headers: dict[str, str]) -> bool:
+        """Whether host and origin are this machine's. A foreign name may have been bent to our address."""
+        host = headers.get("host", "")
+        name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
+        origin = headers.get("origin")
+        return _is_address(name.strip("[]"), self.host) and origin in (None, f"http://{host}")
+
+
+def _is_address(name: str, host: str) -> bool:
+    if name in ("localhost", host, socket.gethostname()):
+        return True
+    try:
+        address = ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return address.is_loopback or host not in ("127.0.0.1", "localhost", "::1")

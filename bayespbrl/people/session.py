@@ -1,0 +1,276 @@
+"""One sitting: a learner, the person or people who answer, and a thread that thinks.
+
+A turn is one state of the run, and each turn takes one answer or one undo: question → answer → thinking → question. The
+answer is in the log, flushed, before `answer` returns. While a person looks, the thread computes what follows
+(`foresight`) and draws it.
+"""
+
+import re
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayespbrl import checks, events, queries
+from bayespbrl.envs.opening import environment_name
+from bayespbrl.events import Entry, LearnerState
+from bayespbrl.learner import Learner
+from bayespbrl.models.likelihoods import prob
+from bayespbrl.people.clips import Clip, Clips
+from bayespbrl.people.foresight import Foresight, Moment
+from bayespbrl.preferences import Answer, parse_answer
+
+View = Mapping[str, Any]
+THINKING, QUESTION, FINISHED, FAILED = "thinking", "question", "finished", "failed"
+# An answer that is expected to tell less changes little: then the page says that a person may stop.
+LITTLE = queries.LEAST_INFORMATION / np.log(2)  # bits
+
+
+class Stale(ValueError):
+    """An answer to a turn that is over, as from a second window."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a person is shown of a question: the clips, and what the learner says about it, as plain data."""
+
+    clips: tuple[Clip, Clip]
+    said: View
+
+
+class Session:
+    """A sitting over a learner, safe to call from any thread.
+
+    Args:
+      learner: it must not be used elsewhere while the session is open.
+      most_answers: of this sitting, after which it is finished; None: as many as the run takes.
+      answerer: name of who answers, kept beside the answers.
+
+    Raises:
+      ValueError: a finished run, a bad number or a bad name.
+    """
+
+    def __init__(self, learner: Learner, *, most_answers: int | None = None, answerer: str | None = None):
+        if learner.finished:
+            raise ValueError("learner: expected one with questions left, got a finished run")
+        if most_answers is not None:
+            checks.whole("answers", most_answers)
+        if answerer is not None:
+            checks.short_name("answerer", answerer)
+        self.learner, self.most_answers, self.answerer = learner, most_answers, answerer
+        self._clips = Clips(learner)
+        self._foresight = Foresight(learner.cycle, learner.state, self._show, answerer)
+        self._changed = threading.Condition(threading.RLock())
+        self._turn, self._closing = 1, False
+        self._before = learner.preferences.answers  # given in earlier sittings
+        self._listeners: list[Callable[[], None]] = []
+        self._view: View = self._described(THINKING)
+        self._sheets: tuple[int, tuple[Clip, Clip]] | None = None
+        self._thread = threading.Thread(target=self._think, name="bayespbrl-session", daemon=True)
+
+    def open(self) -> "Session":
+        """Start to think; returns the session."""
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Stop after the step of the cycle that is being computed. Nothing is lost."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    @property
+    def view(self) -> View:
+        """What a page or widget shows now, as plain data; never changed, only replaced."""
+        return self._view
+
+    @property
+    def over(self) -> bool:
+        """Whether the sitting is finished, or has failed."""
+        return self._view["phase"] in (FINISHED, FAILED)
+
+    def sheet(self, turn: int, side: int) -> bytes:
+        """The sprite sheet of a clip of the question of a turn, side 0 or 1; `Stale` where the turn is over."""
+        sheets = self._sheets
+        if sheets is None or sheets[0] != turn:
+            raise Stale(f"turn: expected one with a question, got {turn}")
+        return sheets[1][side].sheet
+
+    def listen(self, callback: Callable[[], None]) -> Callable[[], None]:
+        """Call `callback`, from any thread, whenever `view` is another; returns what ends that."""
+        self._listeners.append(callback)
+        return lambda: self._listeners.remove(callback)
+
+    def wait(self, phases: tuple[str, ...] = (QUESTION, FINISHED, FAILED), timeout: float | None = None) -> View:
+        """The view, once it is in one of `phases`."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._view["phase"] in phases, timeout):
+                raise TimeoutError(f"expected {' or '.join(phases)}, still {self._view['phase']}")
+            return self._view
+
+    def answer(self, turn: int, answer: str, seconds: float | None = None) -> None:
+        """Take the answer to the question of `turn`, or an undo there; it is on the disk when this returns.
+
+        Raises:
+          Stale: the turn is over, or its question is not there yet; nothing has happened.
+          ValueError: no answer, a bad time, or nothing to take back; nothing has happened.
+        """
+        with self._changed:
+            if turn != self._turn or self._view["phase"] != QUESTION:
+                raise Stale(f"turn: expected {self._turn}, got {turn}")
+            if answer == Answer.UNDO:
+                self._undo()
+            else:
+                self._take(answer, seconds)
+            self._settle()
+
+    def _undo(self) -> None:
+        self.learner.undo()
+        self._turn += 1
+        self._foresight.back(self.learner.state)
+
+    def _take(self, answer: str, seconds: float | None) -> None:
+        query = self.learner.state.query
+        assert query is not None
+        given = parse_answer(answer)
+        self.learner.record(events.answered(query.number, given, answerer=self.answerer, seconds=seconds))
+        self._turn += 1
+        moment = self._foresight.move(given, self.learner.state)
+        try:
+            if moment.complete:  # the next question can be looked at while its events are written
+                self._publish(moment)
+            for entry in moment.entries:
+                self.learner.record(entry)
+        except Exception as error:  # a full disk, or another learner in the run: this answer is kept all the same
+            self._failed(moment, error)
+
+    # The thread that thinks.
+
+    def _think(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing or self._pending() is not None)
+                moment = self._pending()
+            if self._closing or moment is None:
+                return
+            try:
+                entry = self._foresight.compute(moment)
+                with self._changed:
+                    self._keep(moment, entry)
+            except Exception as error:  # the environment's, or a full disk
+                with self._changed:
+                    self._failed(moment, error)
+
+    def _pending(self) -> Moment | None:
+        return None if self.over else self._foresight.pending()
+
+    def _keep(self, moment: Moment, entry: Entry | None) -> None:
+        if entry is not None:
+            if moment is self._foresight.present:
+                self.learner.record(entry)
+            self._foresight.keep(moment, entry)
+        if moment is self._foresight.present:
+            self._settle()
+
+    def _failed(self, moment: Moment, error: Exception) -> None:
+        moment.failed = True
+        if moment is self._foresight.present:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            self._set(self._described(FAILED) | {"say": f"Stopped: {reason} Your answers are kept."})
+
+    def _settle(self) -> None:
+        """Bring the view up to date with the present moment, and the thread to work."""
+        present = self._foresight.present
+        if present.failed:
+            return
+        if present.complete:
+            self._publish(present)
+        elif self._view["turn"] != self._turn:
+            self._set(self._described(THINKING))
+        self._changed.notify_all()
+
+    # What is shown.
+
+    def _show(self, state: LearnerState) -> tuple[Shown, tuple[Answer, ...]]:
+        """The clips of the question that waits, and the answers to it, the likeliest first."""
+        query = state.query
+        assert query is not None
+        clips = self._clips.of(query)
+        said: dict[str, Any] = {"worth": None, "sure": None, "advice": ""}
+        first = 0.5
+        if state.estimate is not None and state.estimate.posterior is not None:
+            draws = state.estimate.trajectory_draws(query.trajectories, number=queries.QUERY_DRAWS)
+            likelihood = state.estimate.likelihood(queries.QUERY_DRAWS)
+            first = float(prob(likelihood, draws[:, :1] - draws[:, 1:]).mean())
+            worth = queries.expected_information(draws[:, :1], draws[:, 1:], likelihood=likelihood)
+            said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
+            if said["worth"] < LITTLE:
+                said["advice"] = (
+                    f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
+                )
+        likely = (Answer.FIRST, Answer.SECOND) if first >= 0.5 else (Answer.SECOND, Answer.FIRST)
+        return Shown(clips, said), (*likely, Answer.TIE, Answer.SKIP)
+
+    def _described(self, phase: str, state: LearnerState | None = None) -> dict[str, Any]:
+        state, settings = state or self.learner.state, self.learner.settings
+        return {
+            "phase": phase,
+            "turn": self._turn,
+            "task": re.sub(r"^bayespbrl/|-v\d+$", "", environment_name(self.learner.environment)),
+            "answered": state.preferences.answers,
+            "budget": settings.questions.answers,
+            "undo": state.previous is not None,
+            "say": "",
+        }
+
+    def _publish(self, moment: Moment) -> None:
+        state = moment.state
+        done = self.most_answers is not None and state.preferences.answers - self._before >= self.most_answers
+        if state.query is None or done:
+            self._set(self._described(FINISHED, state) | {"say": self._ending(state)})
+            return
+        shown: Shown = moment.shown
+        self._sheets = self._turn, shown.clips
+        clips = [clip.described() for clip in shown.clips]
+        view = self._described(QUESTION, state) | {"clips": clips, "rate": self._clips.rate(shown.clips)}
+        self._set(view | dict(shown.said))
+
+    def _ending(self, state: LearnerState) -> str:
+        """Why there is no further question."""
+        answers, budget = state.preferences.answers, self.learner.settings.questions.answers
+        if state.query is not None:
+            return (
+                f"These were the {answers - self._before} answers of this sitting. Thank you! The run can go on later."
+            )
+        if budget is not None and answers >= budget:
+            return f"All {answers} answers are given, and the policy has caught up with them. Thank you!"
+        if state.iteration >= self.learner.settings.most_iterations:
+            return f"The run has done its {state.iteration} iterations, with {answers} answers. Thank you!"
+        return (
+            f"The learner can foresee your answers: none was worth {LITTLE:.2f} bit in the last {state.unasked} "
+            f"iterations. It stops after {answers} answers. Thank you!"
+        )
+
+    def _set(self, view: View) -> None:
+        if view == self._view:
+            return
+        self._view = view
+        self._changed.notify_all()
+        for callback in list(self._listeners):
+            callback()
+
+
+def answer_of(message: Any) -> tuple[int, str, float | None]:
+    """Turn, answer and seconds of a message of the front end; `ValueError` where it is none."""
+    if not isinstance(message, dict) or not set(message) <= {"turn", "answer", "seconds"}:
+        raise ValueError("answer: expected turn, answer and seconds")
+    turn, answer, seconds = (message.get(name) for name in ("turn", "answer", "seconds"))
+    if type(turn) is not int or not isinstance(answer, str):
+        raise ValueError(f"answer: expected the number of a turn and an answer, got {turn!r} and {answer!r}"[:200])
+    if seconds is not None and (isinstance(seconds, bool) or not isinstance(seconds, int | float)):
+        raise ValueError("seconds: expected a number")
+    return turn, answer, seconds

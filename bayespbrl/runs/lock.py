@@ -1,0 +1,35 @@
+"""Who continues a run: one process at a time."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows, where the log's own check has to do
+    fcntl = None  # type: ignore[assignment]
+
+
+@contextmanager
+def continuing(directory: Path | str) -> Iterator[None]:
+    """Hold a run directory. The system lets go of it when the process ends, however that is.
+
+    Raises:
+      ValueError: another process continues the run, or the directory is no run.
+    """
+    try:
+        held = os.open(Path(directory) / "settings.json", os.O_RDONLY)
+    except OSError as error:
+        raise ValueError(f"{directory}: expected a run directory with its settings.json, got {error}") from error
+    try:
+        if fcntl is not None:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise ValueError(
+                    f"{directory}: this run is being continued elsewhere; stop that program first"
+                ) from error
+        yield
+    finally:
+        os.close(held)

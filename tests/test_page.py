@@ -1,0 +1,371 @@
+"""The page in a browser: a scripted person, two tabs, lost connections, killed servers."""
+
+import http.client
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing, contextmanager
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from toys import QUICK, Slope, fingerprint
+
+import bayespbrl
+from bayespbrl.people.page import LARGEST_BODY, Page
+from bayespbrl.people.session import Session
+
+FLAGS = [
+    "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking",
+    "--disable-component-update --disable-sync",
+]
+READY = ".bp-box[data-phase=question][data-locked=false]"
+KEYS = {"first": "ArrowLeft", "second": "ArrowRight", "tie": "ArrowDown", "skip": "s", "undo": "u"}
+KILLS = int(os.environ.get("BAYESPBRL_KILLS", "2"))  # of the server, in the test of killed servers
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """The system's Chromium, headless."""
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium")
+    assert chromium, "no chromium on the PATH: install it, for example with `apt-get install chromium`"
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=chromium, args=" ".join(FLAGS).split())
+        yield started
+        started.close()
+
+
+@contextmanager
+def served(learner, **options):
+    """A page on the questions of a learner."""
+    page = Page(Session(learner, **options))
+    server = threading.Thread(target=page.serve)
+    server.start()
+    try:
+        yield page
+    finally:
+        page.stop()
+        server.join()
+
+
+@pytest.fixture
+def gridworld(tmp_path):
+    """A small run, kept on the disk, and the page that asks its questions."""
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
+    with served(learner) as page:
+        yield page
+
+
+@contextmanager
+def tab(browser, page, **options):
+    """A tab of the browser in a context of its own, which shows a question."""
+    context = browser.new_context(**options)
+    try:
+        opened = context.new_page()
+        opened.on("pageerror", lambda error: pytest.fail(f"JavaScript: {error}"))
+        opened.goto(page.address)
+        opened.wait_for_selector(READY)
+        yield opened
+    finally:
+        context.close()
+
+
+def turn_of(opened):
+    return int(opened.get_attribute(".bp-box", "data-turn"))
+
+
+def next_turn(opened, turn):
+    """Wait for the question after a turn, or for the end."""
+    opened.wait_for_selector(f"{READY}:not([data-turn='{turn}']), .bp-box[data-phase=finished]")
+
+
+def press(opened, answer):
+    turn = turn_of(opened)
+    opened.keyboard.press(KEYS[answer])
+    next_turn(opened, turn)
+
+
+def answers_of(page):
+    """The answers in the log, those taken back among them."""
+    events = map(json.loads, page.session.learner.log.log_file.read_text().splitlines())
+    return [event.get("answer", "undone") for event in events if event["event"] in ("answered", "undone")]
+
+
+def test_a_scripted_person_answers_a_whole_run_as_the_simulated_expert_does(browser, gridworld):
+    expert, requests = bayespbrl.ReturnExpert(), []
+    with tab(browser, gridworld) as opened:
+        opened.on("request", lambda request: requests.append(request.url))
+        while opened.get_attribute(".bp-box", "data-phase") != "finished":
+            query = gridworld.session.learner.state.query
+            press(opened, str(expert(*query.trajectories)))
+        assert "4 answers" in opened.inner_text(".bp-ask")
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(expert)
+    assert learner.preferences.answers == 4
+    assert fingerprint(gridworld.session.learner) == fingerprint(learner)
+    assert requests
+    assert [url for url in requests if not url.startswith(gridworld.address)] == []
+
+
+def test_every_key_and_button_gives_its_answer(browser, gridworld):
+    with tab(browser, gridworld) as opened:
+        press(opened, "tie")
+        press(opened, "undo")
+        for answer in ("skip", "tie"):
+            turn = turn_of(opened)
+            opened.click(f"[data-answer={answer}]")
+            next_turn(opened, turn)
+        turn = turn_of(opened)
+        opened.focus("[data-answer=second]")
+        opened.keyboard.press("Enter")
+        next_turn(opened, turn)
+        given = ["tie", "undone", "skip", "tie", "second"]
+        assert answers_of(gridworld) == given
+        events = map(json.loads, gridworld.session.learner.log.log_file.read_text().splitlines())
+        assert all(event["seconds"] > 0 for event in events if event["event"] == "answered")
+
+
+def test_a_key_that_is_held_or_pressed_twice_answers_once(browser, gridworld):
+    with tab(browser, gridworld) as opened:
+        turn = turn_of(opened)
+        opened.evaluate(
+            "for (const repeat of [false, true, false, false])"
+            " document.body.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft', repeat, bubbles: true}))"
+        )
+        next_turn(opened, turn)
+        assert answers_of(gridworld) == ["first"]
+
+
+def test_a_reload_and_a_second_tab_show_the_same_question_and_count_no_answer_twice(browser, gridworld):
+    with tab(browser, gridworld) as opened, tab(browser, gridworld) as other:
+        press(opened, "first")
+        turn = turn_of(opened)
+        opened.reload()
+        opened.wait_for_selector(READY)
+        other.wait_for_selector(f"{READY}[data-turn='{turn}']")
+        assert turn_of(opened) == turn
+        # both answer the same question at once
+        for each in (opened, other):
+            each.evaluate("setTimeout(() => document.querySelector('[data-answer=second]').click(), 100)")
+        next_turn(opened, turn)
+        next_turn(other, turn)
+        assert answers_of(gridworld) == ["first", "second"]
+
+
+@pytest.mark.parametrize("heard", [False, True])
+def test_an_answer_whose_connection_is_lost_is_sent_again_and_counts_once(browser, gridworld, heard):
+    """The request is lost, or (`heard`) its reply."""
+    lost = []
+
+    def lose(route):
+        if lost:
+            return route.continue_()
+        if heard:
+            route.fetch()
+        lost.append(route.request.post_data)
+        return route.abort()
+
+    with tab(browser, gridworld) as opened:
+        opened.route("**/answer", lose)
+        press(opened, "second")
+        opened.wait_for_selector(READY)
+        assert len(lost) == 1
+        assert answers_of(gridworld) == ["second"]
+
+
+def test_the_clips_stay_in_step_and_can_be_paused_scrubbed_and_sped_up(browser):
+    with (
+        served(bayespbrl.Learner("swing-up", expert="page", **QUICK | {"max_steps": None})) as page,
+        tab(browser, page) as opened,
+    ):
+        watch = """async (seconds) => {
+          const seen = [], until = performance.now() + 1000 * seconds;
+          const canvases = [...document.querySelectorAll("canvas")];
+          while (performance.now() < until) {
+            await new Promise(requestAnimationFrame);
+            seen.push(canvases.map((canvas) => Number(canvas.dataset.frame)));
+          }
+          return seen;
+        }"""
+        seen = np.array(opened.evaluate(watch, 1.0))
+        assert abs(seen[:, 0] - seen[:, 1]).max() <= 1
+        assert len(set(seen[:, 0])) >= 3  # it moves
+        opened.keyboard.press(" ")
+        assert len(set(map(tuple, opened.evaluate(watch, 0.2)))) == 1
+        opened.fill(".bp-scrub", "500")
+        assert opened.evaluate(watch, 0.1)[-1] == [30, 30]
+        opened.click(".bp-again")
+        assert opened.evaluate(watch, 0.1)[-1] == [0, 0]
+        opened.select_option(".bp-speed select", "4")
+        opened.focus(".bp-box")
+        opened.keyboard.press(" ")
+        assert np.array(opened.evaluate(watch, 0.5)).max() >= 15  # of 60 frames in three seconds at speed 1
+        assert page.session.learner.preferences.answers == 0
+
+
+def test_it_can_be_used_with_reduced_motion_on_a_phone_and_by_a_screen_reader(browser, gridworld):
+    phone = {"viewport": {"width": 360, "height": 700}, "reduced_motion": "reduce"}
+    with tab(browser, gridworld, **phone) as opened:
+        assert opened.get_attribute(".bp-play", "aria-label") == "Play"
+        assert opened.evaluate("document.documentElement.scrollWidth") <= 360
+        assert opened.get_attribute("canvas", "aria-label") == "First: 20 steps"
+        assert "Which one is better?" in opened.inner_text("[aria-live=polite]")
+        names = opened.evaluate(
+            "[...document.querySelectorAll('button')].map((b) => b.ariaLabel ?? b.innerText.trim())"
+        )
+        assert all(names)
+        targets = opened.evaluate(
+            "[...document.querySelectorAll('button')].map((b) => b.getBoundingClientRect().height)"
+        )
+        assert min(targets) >= 44
+
+
+def call(page, method, path, body=None, **headers):
+    """Status and text of a request to a page."""
+    with closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)) as connection:
+        connection.request(method, path, body, headers)
+        with connection.getresponse() as reply:
+            return reply.status, reply.read().decode(errors="replace")
+
+
+def test_nonsense_is_refused_and_changes_nothing(gridworld):
+    gridworld.session.wait(timeout=60)
+    token = f"/{gridworld.token}"
+    turn = gridworld.session.view["turn"]
+    good = json.dumps({"turn": turn, "answer": "first", "seconds": 1.0})
+    before = gridworld.session.learner.log.log_file.read_bytes()
+    foreign = {"Origin": "http://example.org"}
+    assert call(gridworld, "GET", f"{token}/")[0] == 200
+    for path in ("/", "/answer", "/events", "/wrong/", f"/{gridworld.token[:-1]}/", f"{token}"):
+        assert call(gridworld, "GET", path)[0] == 403
+    assert call(gridworld, "POST", "/wrong/answer", good)[0] == 403
+    assert call(gridworld, "POST", f"{token}/answer", good, **foreign)[0] == 403
+    assert call(gridworld, "POST", f"{token}/answer", good, Host="example.org")[0] == 403
+    assert call(gridworld, "GET", f"{token}/answer")[0] == 405
+    for path in ("/secret", f"/clip/{turn}/2", f"/clip/{turn + 1}/0", "/../page.py"):
+        assert call(gridworld, "GET", token + path)[0] == 404
+    assert call(gridworld, "POST", f"{token}/answer", b" " * (LARGEST_BODY + 1))[0] == 413
+    nonsense = [
+        b"",
+        b"\xff",
+        b"[" * 3000,
+        "null",
+        '"first"',
+        json.dumps({"turn": turn}),
+        json.dumps({"turn": str(turn), "answer": "first"}),
+        json.dumps({"turn": turn, "answer": "left"}),
+        json.dumps({"turn": turn, "answer": "first", "seconds": -1}),
+        json.dumps({"turn": turn, "answer": "first", "seconds": float("nan")}),
+        json.dumps({"turn": turn, "answer": "first", "seconds": "long"}),
+        json.dumps({"turn": turn, "answer": "first", "more": 1}),
+        json.dumps({"turn": turn, "answer": "undo"}),  # nothing to take back
+    ]
+    for body in nonsense:
+        status, text = call(gridworld, "POST", f"{token}/answer", body)
+        assert (status, text.count("\n")) == (400, 0), body
+    for wrong in (turn - 1, turn + 1):
+        assert call(gridworld, "POST", f"{token}/answer", json.dumps({"turn": wrong, "answer": "first"}))[0] == 409
+    assert gridworld.session.learner.log.log_file.read_bytes() == before
+    assert call(gridworld, "POST", f"{token}/answer", good)[0] == 204
+
+
+def test_ten_megabytes_are_not_read(gridworld):
+    with closing(http.client.HTTPConnection("127.0.0.1", gridworld.port, timeout=20)) as connection:
+        connection.putrequest("POST", f"/{gridworld.token}/answer")
+        connection.putheader("Content-Length", str(10_000_000))
+        connection.endheaders()
+        connection.send(b" " * 100_000)
+        with connection.getresponse() as reply:
+            assert reply.status == 413
+
+
+def test_a_port_in_use_is_refused(gridworld):
+    with pytest.raises(ValueError, match=f"port {gridworld.port} on 127.0.0.1: cannot listen"):
+        Page(Session(bayespbrl.Learner("gridworld", **QUICK)), port=gridworld.port)
+
+
+def test_an_environment_that_fails_while_a_person_answers_says_so(browser):
+    learner = bayespbrl.Learner(Slope("raises", at=250), expert="other", **QUICK)
+    with served(learner) as page, tab(browser, page) as opened:
+        while opened.get_attribute(".bp-box", "data-phase") == "question":
+            opened.keyboard.press("ArrowLeft")
+            opened.wait_for_selector(f"{READY}, .bp-box[data-phase=failed]")
+        assert "the motor is on fire" in opened.inner_text(".bp-ask")
+        assert learner.preferences.answers >= 1
+
+
+class Person:
+    """Answers on a server that is killed again and again: first, second, first, … by the number of the answer."""
+
+    def __init__(self, directory):
+        self.directory, self.acknowledged = directory, []
+
+    def sit(self, seconds):
+        """Start the server and answer until it is over; kill it after so many seconds of answering, None for never.
+
+        Returns whether the run is finished.
+        """
+        command = [sys.executable, "-m", "bayespbrl", "ask", str(self.directory)]
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        try:
+            lines = iter(server.stdout.readline, "")
+            address = urlsplit(next(line.strip() for line in lines if line.startswith("http://")))
+            killer = None
+            for view in self._views(address):
+                if killer is None and seconds is not None:
+                    killer = threading.Timer(seconds, server.kill)
+                    killer.start()
+                if view["phase"] == "question":
+                    self._answer(address, view)
+                if view["phase"] == "finished":
+                    return True
+        except (OSError, http.client.HTTPException):
+            return False
+        finally:
+            server.kill()
+            server.wait()
+            server.stdout.close()
+        return False
+
+    def _views(self, address):
+        with closing(http.client.HTTPConnection(address.hostname, address.port, timeout=60)) as connection:
+            connection.request("GET", address.path + "events")
+            with connection.getresponse() as reply:
+                while line := reply.readline():
+                    if line.startswith(b"data: "):
+                        yield json.loads(line[6:])
+
+    def _answer(self, address, view):
+        given = view["answered"], ("first", "second")[view["answered"] % 2]
+        body = json.dumps({"turn": view["turn"], "answer": given[1], "seconds": 0.5})
+        with closing(http.client.HTTPConnection(address.hostname, address.port, timeout=60)) as connection:
+            connection.request("POST", address.path + "answer", body)
+            with connection.getresponse() as reply:
+                assert reply.status == 204
+        self.acknowledged.append(given)
+
+
+@pytest.mark.slow
+def test_a_server_that_is_killed_at_any_moment_loses_no_answer_and_counts_none_twice(tmp_path):
+    options = QUICK | {"iterations": 12}
+    bayespbrl.start("gridworld", tmp_path / "run", expert="page", **options)
+    person, rng = Person(tmp_path / "run"), random.Random(0)
+    for _ in range(KILLS):
+        person.sit(rng.uniform(0.0, 0.6))
+    while not person.sit(None):
+        time.sleep(0.1)
+    events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    answered = [event for event in events if event["event"] == "answered"]
+    assert [event["query"] for event in answered] == list(range(1, 14))
+    kept = list(enumerate(event["answer"] for event in answered))
+    assert set(person.acknowledged) <= set(kept)
+    assert len(person.acknowledged) == len(set(person.acknowledged)) >= len(kept) - KILLS
+    answers = iter([answer for _, answer in kept])
+    learner = bayespbrl.Learner("gridworld", expert="other", **options).run(lambda first, second: next(answers))
+    assert fingerprint(bayespbrl.load(tmp_path / "run").learner) == fingerprint(learner)
