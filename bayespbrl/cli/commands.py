@@ -1,8 +1,9 @@
-"""The command line: `bayespbrl run`, `resume`, `report`, `trials`."""
+"""The command line: `bayespbrl run`, `resume`, `report`, `trials`, `study`, `results`."""
 
 import inspect
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -10,9 +11,11 @@ import typer
 
 from bayespbrl import checks, runs
 from bayespbrl.cli.display import PICTURE, console, progress_bar, run_to_the_end, show_run, show_trials
+from bayespbrl.cli.studies import run_study, show_plan
 from bayespbrl.runs.directory import fresh_directory
 from bayespbrl.settings import OPTIONS, PARTS, Settings
-from bayespbrl.studies import run_trials
+from bayespbrl.studies import Study, declared, run_trials
+from bayespbrl.studies.cluster import scheduler_executor
 
 app = typer.Typer(
     help="Preference-based reinforcement learning: a policy from answers to 'which of these two is better?'.",
@@ -55,7 +58,8 @@ RUN_OPTIONS = {
     "policy": "Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.",
     "centres": "Number of radial basis functions of each kind of feature.",
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
-    "expert": "Who answers: return (simulated) or terminal (you).",
+    "expert": "Who answers: return (simulated, always right), terminal (you), or a simulated expert who errs: "
+    "stochastic, myopic, skipping, equal, mistaken (B-Pref's teachers) or margin (that of Programming by Feedback).",
 }
 
 
@@ -135,6 +139,36 @@ def trials(
             raise
         bar.update(task, completed=number)
     show_trials(study)
+
+
+Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://host:8786.")]
+
+
+@app.command()
+def study(
+    name: Annotated[str, typer.Argument(help="A shipped study, or a TOML file.", metavar="NAME|FILE.toml")],
+    *,
+    number: Annotated[int | None, typer.Option("--trials", help="Trials of each row; as declared if omitted.")] = None,
+    jobs: Annotated[int, typer.Option(help="Number of trials at a time, each in its own process.")] = 1,
+    scheduler: Scheduler = None,
+    out: Annotated[Path | None, typer.Option(help="Directory of the study; runs/study-NAME if omitted.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say how many cells there are, and how long.")
+    ] = False,
+) -> None:
+    """Run a declared study: tasks, methods, noise, seeds. Finished cells are not repeated."""
+    checks.whole("jobs", jobs)
+    declaration = declared(name)
+    prepared = Study.prepare(declaration, out or Path("runs") / f"study-{declaration.name}", trials=number)
+    show_plan(prepared, jobs)
+    if dry_run:
+        return
+    options = f" --trials {number}" if number is not None else ""
+    options += f" --scheduler {scheduler}" if scheduler else f" --jobs {jobs}"
+    with scheduler_executor(scheduler) if scheduler else nullcontext(jobs) as where:
+        failures = run_study(prepared, where, f"bayespbrl study {name}{options}")
+    if failures:
+        raise ValueError(f"{len(failures)} of {prepared.cells} trials failed; the first: {failures[0]}")
 
 
 def main() -> None:
