@@ -34,7 +34,7 @@ RUN_OPTIONS = {
     "utility": "Estimate of the utility: posterior-mean, most-likely, posterior-draw, linear-program, or known-reward "
     "(a reference run trained on the hidden reward).",
     "query": "Rule that selects the trajectories to ask about: information-when-unsure (default), highest-utility (the "
-    "paper's), probably-better, thompson, information or disagreement.",
+    "paper's), probably-better, thompson, information, disagreement or eubo (expected utility of the best option).",
     "schedule": "KL bound of each update: confidence (default), which scales it with the confidence that the update is "
     "an improvement, or constant (the paper's).",
     "hyperparameters": "Length scales, steepness and lapse rate: inferred (part of the posterior, unless --steepness "
