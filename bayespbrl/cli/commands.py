@@ -171,6 +171,21 @@ def study(
         raise ValueError(f"{len(failures)} of {prepared.cells} trials failed; the first: {failures[0]}")
 
 
+@app.command()
+def results(
+    directories: Annotated[list[Path], typer.Argument(help="Directories of studies.", metavar="DIR...")],
+    *,
+    out: Annotated[Path | None, typer.Option(help="Where to write; into each study's directory if omitted.")] = None,
+) -> None:
+    """Write tables (Markdown, CSV) and figures of studies, with intervals and counted comparisons."""
+    from bayespbrl.results import write_results
+
+    for directory in directories:
+        folder = out / directory.name if out is not None and len(directories) > 1 else out
+        page, *others = write_results(directory, folder)
+        console.print(f"Results: {page}; {', '.join(path.name for path in others)}")
+
+
 def main() -> None:
     """Entry point. Bad input gives one line on standard error and exit status 2."""
     try:

@@ -36,8 +36,8 @@ from bayespbrl import checks
 from bayespbrl.settings import OPTIONS
 
 AXES = ("tasks", "methods", "noise", "variants")
-OWN = ("title", "trials", "seed", "options", "leave_out", *AXES)
-OF_A_LEVEL = {"tasks": ("env", "minutes", "failed_below"), "methods": ("untrained",)}
+OWN = ("title", "trials", "seed", "report_at", "options", "leave_out", *AXES)
+OF_A_LEVEL = {"tasks": ("env", "minutes", "failed_below"), "methods": ("untrained",), "variants": ("minutes",)}
 LEVEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 Options = Mapping[str, Any]
 
@@ -78,6 +78,7 @@ class Declaration:
       trials, seed: of each row.
       rows: in their order.
       text: the TOML.
+      report_at: numbers of answers after which the tables give values, too.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Declaration:
     seed: int
     rows: tuple[DeclaredRow, ...]
     text: str
+    report_at: tuple[int, ...] = ()
 
 
 def shipped() -> list[str]:
@@ -140,7 +142,11 @@ def parsed(text: str, name: str) -> Declaration:
     if not isinstance(title, str):
         raise ValueError(f"{where}: expected a title, got {title!r}")
     trials = checks.whole(f"{where}, trials", content.get("trials", 20))
-    return Declaration(name, title, trials, checks.whole(f"{where}, seed", content.get("seed", 1000), 0), rows, text)
+    seed = checks.whole(f"{where}, seed", content.get("seed", 1000), 0)
+    if not isinstance(report_at := content.get("report_at", []), list):
+        raise ValueError(f"{where}, report_at: expected a list of numbers of answers, got {report_at!r}")
+    numbers = tuple(checks.whole(f"{where}, report_at", number) for number in report_at)
+    return Declaration(name, title, trials, seed, rows, text, numbers)
 
 
 def _axis(where: str, axis: str, content: Mapping[str, Any]) -> dict[str, Options]:
@@ -204,7 +210,7 @@ def _row(common: Options, chosen: tuple[tuple[str, Options], ...]) -> DeclaredRo
     merged = dict(common)
     for _, options in chosen:
         merged |= options
-    own = {name: merged.pop(name, None) for names in OF_A_LEVEL.values() for name in names}
+    own = {name: merged.pop(name, None) for name in set().union(*OF_A_LEVEL.values())}
     return DeclaredRow(
         (levels[0], levels[1], levels[2], levels[3]),
         own["env"] or levels[0],

@@ -93,10 +93,13 @@ class Engine:
         return self.failures
 
     def _submit_all(self) -> None:
-        for place, row in enumerate(self.rows):
-            for seed in row.to_do():
-                if (place, seed) not in self._starts:
-                    self._submit(place, seed)
+        """The first trial of each row, then the second of each: a study that is stopped has something of every row."""
+        new = [
+            (seed - row.row.settings.seed, place, seed) for place, row in enumerate(self.rows) for seed in row.to_do()
+        ]
+        for _, place, seed in sorted(new):
+            if (place, seed) not in self._starts:
+                self._submit(place, seed)
 
     def _submit(self, place: int, seed: int) -> None:
         self._starts[place, seed] = self._starts.get((place, seed), 0) + 1
