@@ -135,7 +135,7 @@ def _read(file: Path, columns: list[str]) -> pd.DataFrame:
         raise ValueError(f"{file}: expected the columns {', '.join(columns)}, got none of {', '.join(missing)}")
     table[list(AXES)] = table[list(AXES)].fillna("")
     for name in ("seed", "iteration", "answers", "value", "predicted"):
-        if len(table) and name in table and not np.issubdtype(table[name].dtype, np.number):
+        if len(table) and name in table and not pd.api.types.is_numeric_dtype(table[name]):
             raise ValueError(f"{file}: expected numbers as {name}, got {table[name].dtype}")
     return table
 
