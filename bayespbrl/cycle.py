@@ -14,6 +14,7 @@ import numpy as np
 
 from bayespbrl import events, queries, rollouts
 from bayespbrl.events import Entry, LearnerState
+from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
 from bayespbrl.improvement import schedules
 from bayespbrl.improvement.check import Check, checked
@@ -136,7 +137,7 @@ class Cycle:
         check = self._check(state, utility) if self.settings.update.checked else None
         improved, bound = self.update(state, utility, check)
         clock.append(time.perf_counter())
-        evaluated = self._evaluated(improved.policy)
+        evaluated = self.evaluated(improved.policy)
         value = float(evaluated.total.mean())
         clock.append(time.perf_counter())
         seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
@@ -160,7 +161,7 @@ class Cycle:
             estimate=utility,
         )
 
-    def _evaluated(self, policy: Any) -> rollouts.Returns:
+    def evaluated(self, policy: Any) -> rollouts.Returns:
         """Fresh episodes, the same for all policies of the run; the learner never sees them."""
         options = self.settings.rollouts
         return rollouts.returns(
@@ -174,7 +175,7 @@ class Cycle:
     def _value_of(self, state: LearnerState, number: int) -> float:
         """The value of the policy after so many iterations."""
         if number == 0:  # the first policy
-            value = state.summaries[0]["value"] if state.summaries else self._evaluated(state.policy).total.mean()
+            value = state.summaries[0]["value"] if state.summaries else self.evaluated(state.policy).total.mean()
         else:
             value = state.summaries[number - 1]["value_newest"]
         return float(value)
@@ -195,7 +196,7 @@ class Cycle:
         rng = self._rng(FEATURES, 2 * state.iteration)
         known, rows = state.preferences, state.preferences.rows()
         # Decision: a person may favour a side. The simulated expert does not, and each unknown costs answers.
-        sides = None if settings.expert == "return" else [row.side for row in rows]
+        sides = None if settings.expert in SIMULATED else [row.side for row in rows]
         return estimate(
             Comparisons.among(
                 state.trajectories,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from scipy.special import expit
 
 from bayespbrl import checks
 from bayespbrl.preferences import Answer, parse_answer
@@ -29,10 +30,7 @@ class ReturnExpert:
     """The simulated expert of the paper: prefers the higher undiscounted sum of the hidden reward, without noise."""
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
-        difference = first.total_reward - second.total_reward
-        if abs(difference) <= TIE_TOLERANCE * max(abs(first.total_reward), abs(second.total_reward)):
-            return Answer.TIE
-        return Answer.FIRST if difference > 0 else Answer.SECOND
+        return _preferred(first.total_reward, second.total_reward)
 
 
 @dataclass(frozen=True)
@@ -57,10 +55,144 @@ class NoisyExpert:
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
         answer = parse_answer(self.expert(first, second))
-        marks = sorted(zlib.crc32(t.actions.tobytes(), zlib.crc32(t.states.tobytes())) for t in (first, second))
-        wrong = np.random.default_rng([self.seed, *marks]).random() < self.wrong_answers
-        reversal = {Answer.FIRST: Answer.SECOND, Answer.SECOND: Answer.FIRST}
-        return reversal.get(answer, answer) if wrong else answer
+        return _reversed(answer) if _chance(self.seed, first, second) < self.wrong_answers else answer
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """B-Pref's simulated teacher; each of its five irrational teachers has one parameter that is not the default.
+
+    In this order: it skips a question where neither trajectory is good, calls two of nearly equal return equal, prefers
+    by a discounted return, rationally or as a Boltzmann-rational (Bradley-Terry) chooser, and makes mistakes. What it
+    answers is a function of `seed` and the two trajectories, in either order.
+
+    Attributes:
+      rationality: β, per unit of return: the better one is preferred with probability 1 / (1 + exp(−β |ΔR|)). Infinity,
+        the default, is rational; the *stochastic* teacher has β = 1.
+      discount: γ in (0, 1]: rewards n steps before the last count γⁿ. The *myopic* teacher has γ = 0.9.
+      least_return: both trajectories below it are skipped (the *skipping* teacher).
+      equal_within: returns that differ by less are answered with a tie (the *equal* teacher).
+      mistakes: probability that a preference is reversed. The *mistaken* teacher has 0.1.
+      seed: a whole number >= 0.
+
+    Source: Lee, Smith, Dragan & Abbeel (2021), "B-Pref: Benchmarking preference-based reinforcement learning",
+    section 3 and algorithm 1. Both thresholds are theirs as they are, without their multiple of the current policy's
+    return, on which an expert who sees two trajectories cannot depend.
+    """
+
+    rationality: float = np.inf
+    discount: float = 1.0
+    least_return: float = -np.inf
+    equal_within: float = 0.0
+    mistakes: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (np.isreal(self.rationality) and self.rationality > 0):
+            raise ValueError(f"rationality: expected a number > 0, infinity included, got {self.rationality!r}")
+        if checks.share("discount", self.discount) == 0:
+            raise ValueError(f"discount: expected a number in (0, 1], got {self.discount!r}")
+        if not np.isreal(self.least_return) or np.isnan(self.least_return):
+            raise ValueError(f"least_return: expected a number, got {self.least_return!r}")
+        checks.non_negative("equal_within", self.equal_within)
+        checks.share("mistakes", self.mistakes)
+        checks.whole("seed", self.seed, 0)
+
+    def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
+        returns = first.total_reward, second.total_reward
+        if max(returns) < self.least_return:
+            return Answer.SKIP
+        if abs(returns[0] - returns[1]) < self.equal_within:
+            return Answer.TIE
+        seen = [_discounted_from_the_end(each.rewards, self.discount) for each in (first, second)]
+        answer = _preferred(*seen)
+        wrong = 0.0 if np.isinf(self.rationality) else expit(-self.rationality * abs(seen[0] - seen[1]))
+        # wrong either by chance or by mistake; both at once are right
+        wrong = wrong * (1 - self.mistakes) + (1 - wrong) * self.mistakes
+        return _reversed(answer) if _chance(self.seed, first, second) < wrong else answer
+
+
+@dataclass(frozen=True)
+class MarginExpert:
+    """The simulated expert of "Programming by Feedback" (PF), who errs where two returns differ by less than a width.
+
+    With z = |ΔR| and a threshold δ ~ U(0, `width`), the preference is reversed with probability max(0, ½ (1 − z/δ));
+    over δ that is ½ − z/2M − (z/2M) log(M/z) for z < M = `width`, and 0 beyond. Whether it is reversed is a function of
+    `seed` and the two trajectories, in either order.
+
+    Attributes:
+      width: M > 0, in units of the return.
+      seed: a whole number >= 0.
+
+    Source: Akrour, Schoenauer, Sebag & Souplet (2014), "Programming by feedback", section 3.2.
+    """
+
+    width: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks.positive("width", self.width)
+        checks.whole("seed", self.seed, 0)
+
+    def error_probability(self, difference: float) -> float:
+        """Probability of a wrong answer where the returns differ by `difference`."""
+        share = min(abs(difference) / self.width, 1.0)
+        return 0.5 - share / 2 * (1 - np.log(share)) if share else 0.5
+
+    def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
+        answer = _preferred(first.total_reward, second.total_reward)
+        wrong = self.error_probability(first.total_reward - second.total_reward)
+        return _reversed(answer) if _chance(self.seed, first, second) < wrong else answer
+
+
+def _preferred(first: float, second: float) -> Answer:
+    """By two returns; a tie where they are equal but for rounding."""
+    if abs(first - second) <= TIE_TOLERANCE * max(abs(first), abs(second)):
+        return Answer.TIE
+    return Answer.FIRST if first > second else Answer.SECOND
+
+
+def _reversed(answer: Answer) -> Answer:
+    """The opposite preference; ties and skips stay as they are."""
+    return {Answer.FIRST: Answer.SECOND, Answer.SECOND: Answer.FIRST}.get(answer, answer)
+
+
+def _chance(seed: int, first: Trajectory, second: Trajectory) -> float:
+    """A uniform number in [0, 1), the same for the same two trajectories in either order."""
+    marks = sorted(zlib.crc32(t.actions.tobytes(), zlib.crc32(t.states.tobytes())) for t in (first, second))
+    return float(np.random.default_rng([seed, *marks]).random())
+
+
+def _discounted_from_the_end(rewards: np.ndarray, discount: float) -> float:
+    return float(np.sum(rewards * discount ** np.arange(len(rewards) - 1, -1, -1.0)))
+
+
+# Names of the experts that need no person: the rational one, B-Pref's five teachers, and that of PF.
+SIMULATED = ("return", "stochastic", "myopic", "skipping", "equal", "mistaken", "margin")
+
+
+def named_expert(name: str, *, mean: float = 0.0, scale: float = 1.0, seed: int = 0) -> Expert:
+    """One of `SIMULATED` with the parameters that its source reports.
+
+    Args:
+      name: one of `SIMULATED`.
+      mean, scale: mean and standard deviation of the return of a task's first policy, in whose units the thresholds
+        and β are. Decision: the sources measure in returns of the current policy, which an expert does not know.
+      seed: of its errors.
+
+    Raises:
+      ValueError: an unknown name.
+    """
+    experts: dict[str, Expert] = {
+        "return": ReturnExpert(),
+        "stochastic": Teacher(rationality=1.0 / checks.positive("scale", scale), seed=seed),
+        "myopic": Teacher(discount=0.9),
+        "skipping": Teacher(least_return=mean),
+        "equal": Teacher(equal_within=0.1 * scale),
+        "mistaken": Teacher(mistakes=0.1, seed=seed),
+        "margin": MarginExpert(scale, seed=seed),
+    }
+    return experts[checks.one_of("expert", name, SIMULATED)]
 
 
 def simulated_expert(wrong_answers: float = 0.0, *, seed: int = 0) -> Expert:

@@ -82,14 +82,8 @@ class Learner:
             _chosen("query", query, self.settings.questions.query, queries.QUERY_RULES),
         )
         self.log: Log | None = None
-        if own_policy is None:
-            own_policy = initial_policy(
-                self.settings.rollouts.policy,
-                *spaces,
-                action_scale=self.settings.rollouts.initial_action_scale,
-                period=period,
-            )
-        self.state = events.replay(LearnerState(own_policy), entries)
+        self.own_policy = own_policy
+        self.state = events.replay(LearnerState(self.first_policy()), entries)
 
     def logged(self, log: Log) -> "Learner":
         """The same learner, which from now on appends what happens to `log`."""
@@ -112,6 +106,19 @@ class Learner:
     def last_policy(self) -> Any:
         """The newest policy, which the next trajectories follow."""
         return self.state.policy
+
+    def first_policy(self) -> Any:
+        """The policy of the first trajectories: of the user's own, or random."""
+        if self.own_policy is not None:
+            return self.own_policy
+        options, environment = self.settings.rollouts, self.environment
+        return initial_policy(
+            options.policy,
+            environment.observation_space,
+            environment.action_space,
+            action_scale=options.initial_action_scale,
+            period=environment_attribute(environment, "observation_period"),
+        )
 
     @property
     def worth_asking(self) -> float | None:

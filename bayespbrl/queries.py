@@ -163,6 +163,16 @@ def disagreement(situation: QuerySituation) -> list[int]:
     return _ordered(situation, utilities, better * (1 - better))
 
 
+def eubo(situation: QuerySituation) -> list[int]:
+    """The comparison with the highest expected utility of the best option (EUBO) first: E max(u(τ), u(opponent)).
+
+    Source: Lin, Astudillo, Frazier & Bakshy (2022), "Preference exploration for efficient Bayesian optimization with
+    multiple outcomes", section 4; Astudillo, Lin, Bakshy & Frazier (2023), "qEUBO", eq. 2, with q = 2.
+    """
+    utilities, opponents = situation.draws()
+    return _ordered(situation, utilities, np.maximum(utilities, opponents).mean(axis=0))
+
+
 @dataclass(frozen=True)
 class InformationWhenUnsure:
     """`highest_utility` while the signal is at least `sure`; else `information` about any trajectory never shown.
@@ -187,6 +197,7 @@ QUERY_RULES: dict[str, QueryRule] = {
     "thompson": thompson,
     "information": information,
     "disagreement": disagreement,
+    "eubo": eubo,
     "information-when-unsure": InformationWhenUnsure(),
 }
 

@@ -32,6 +32,7 @@ ROOMS = {
     "studies": ["studies"],
     "diagnostics": ["diagnostics"],
     "report": ["diagnostics.report"],
+    "results": ["results"],
     "command line": ["cli", "__main__"],
 }
 STEPS = ["step 1", "step 2", "step 3", "step 4"]
@@ -53,7 +54,8 @@ BELOW = {
     "studies": [*LEARNED, "runs"],
     "diagnostics": LEARNED,
     "report": [*LEARNED, "runs", "diagnostics"],
-    "command line": [*LEARNED, "runs", "people", "studies", "diagnostics", "report"],
+    "results": [*LEARNED, "runs", "studies", "diagnostics", "report"],
+    "command line": [*LEARNED, "runs", "people", "studies", "diagnostics", "report", "results"],
 }
 # `Run.report` and `Learner.widget` import what stands above them when they are called.
 DOORS = {("runs.run", "diagnostics.report"), ("learner", "people.widget")}
@@ -130,7 +132,7 @@ def test_no_imports_go_round_in_circles():
 def test_the_steps_never_import_each_other_and_only_the_learner_orders_them():
     steps = {module: {floor_of(other) for other in ours(module)} & set(STEPS) for module in INNER}
     assert [module for module in INNER if floor_of(module) in STEPS and steps[module] - {floor_of(module)}] == []
-    above = ("learner", "runs", "people", "studies", "diagnostics", "report", "command line")
+    above = ("learner", "runs", "people", "studies", "diagnostics", "report", "results", "command line")
     assert [module for module in INNER if steps[module] >= set(STEPS) and floor_of(module) not in above] == []
 
 

@@ -3,8 +3,18 @@
 import numpy as np
 import pytest
 
-from bayespbrl.experts import NoisyExpert, ReturnExpert, TerminalExpert
+import bayespbrl
+from bayespbrl.experts import (
+    SIMULATED,
+    MarginExpert,
+    NoisyExpert,
+    ReturnExpert,
+    Teacher,
+    TerminalExpert,
+    named_expert,
+)
 from bayespbrl.preferences import Answer
+from bayespbrl.runs.simulated import expert_of
 from bayespbrl.trajectories import Trajectory
 
 
@@ -116,3 +126,91 @@ def test_a_person_who_types_nonsense_is_asked_again(tmp_path, capsys):
 def test_a_person_can_stop(tmp_path, reply):
     with pytest.raises(KeyboardInterrupt):
         person(tmp_path, reply)(trajectory([0.0]), trajectory([1.0]))
+
+
+def wrong_share(expert, difference, number=4000):
+    """Share of wrong answers about two returns that differ by `difference`, the better one first."""
+    pairs = [(trajectory([difference], 2 * i), trajectory([0.0], 2 * i + 1)) for i in range(number)]
+    return np.mean([expert(*pair) is Answer.SECOND for pair in pairs])
+
+
+def close(share, expected, number=4000):
+    return abs(share - expected) <= 4 * np.sqrt(expected * (1 - expected) / number)
+
+
+def test_the_stochastic_teacher_is_boltzmann_rational():
+    for difference in (0.1, 1.0, 3.0):
+        assert close(wrong_share(Teacher(rationality=2.0, seed=3), difference), 1 / (1 + np.exp(2.0 * difference)))
+
+
+def test_the_mistaken_teacher_errs_as_often_as_told_and_on_top_of_the_stochastic_one():
+    assert close(wrong_share(Teacher(mistakes=0.1, seed=3), 5.0), 0.1)
+    by_chance = 1 / (1 + np.exp(1.0))
+    assert close(wrong_share(Teacher(1.0, mistakes=0.2), 1.0), 0.8 * by_chance + 0.2 * (1 - by_chance))
+
+
+def test_the_myopic_teacher_weighs_the_last_rewards_most():
+    early, late = trajectory([3.0, 0, 0]), trajectory([0, 0, 2.0])
+    assert Teacher()(early, late) is Answer.FIRST
+    assert Teacher(discount=0.9)(early, late) is Answer.FIRST  # 3 · 0.81 > 2
+    assert Teacher(discount=0.8)(early, late) is Answer.SECOND  # 3 · 0.64 < 2
+
+
+def test_the_skipping_and_the_equal_teacher_follow_their_thresholds():
+    low, high = trajectory([1.0]), trajectory([2.0])
+    assert Teacher(least_return=2.5)(low, high) is Answer.SKIP
+    assert Teacher(least_return=1.5)(low, high) is Answer.SECOND
+    assert Teacher(equal_within=1.5)(low, high) is Answer.TIE
+    assert Teacher(equal_within=1.0)(low, high) is Answer.SECOND
+
+
+def test_the_margin_expert_errs_as_programming_by_feedback_says():
+    expert = MarginExpert(width=2.0, seed=1)
+    thresholds = np.random.default_rng(0).uniform(0, 2.0, 200_000)
+    for difference in (0.2, 1.0, 1.8):
+        simulated = np.maximum(0, (1 - difference / thresholds) / 2).mean()
+        assert expert.error_probability(-difference) == pytest.approx(simulated, abs=0.003)
+        assert close(wrong_share(expert, difference), expert.error_probability(difference))
+    assert expert.error_probability(0) == 0.5
+    assert expert.error_probability(2.5) == 0
+
+
+@pytest.mark.parametrize("expert", [Teacher(1.0, seed=2), Teacher(mistakes=0.4, seed=2), MarginExpert(3.0, seed=2)])
+def test_errors_are_a_function_of_the_two_trajectories_in_either_order(expert):
+    pairs = [(trajectory([1.0], 2 * i), trajectory([0.0], 2 * i + 1)) for i in range(60)]
+    turned = {Answer.FIRST: Answer.SECOND, Answer.SECOND: Answer.FIRST}
+    once = [expert(*pair) for pair in pairs]
+    assert [turned[expert(b, a)] for a, b in pairs] == once
+    assert len(set(once)) == 2
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Teacher(rationality=0), "rationality"),
+        (lambda: Teacher(discount=0), "discount"),
+        (lambda: Teacher(least_return=np.nan), "least_return"),
+        (lambda: Teacher(equal_within=-1), "equal_within"),
+        (lambda: Teacher(mistakes=2), "mistakes"),
+        (lambda: MarginExpert(0), "width"),
+        (lambda: named_expert("oracle"), "expert: expected one of return, stochastic"),
+    ],
+)
+def test_bad_parameters_of_the_teachers_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_run_finds_the_expert_that_its_settings_name_in_units_of_its_task():
+    options = {"preset": "paper", "utility": "linear-program", "max_steps": 20, "evaluation_episodes": 2, "seed": 3}
+    found = {name: expert_of(bayespbrl.Learner("gridworld", expert=name, **options)) for name in SIMULATED}
+    assert isinstance(found["return"], ReturnExpert)
+    scale = found["margin"].width
+    assert scale > 0
+    assert found["stochastic"] == Teacher(rationality=1 / scale, seed=3)
+    assert found["equal"] == Teacher(equal_within=0.1 * scale)
+    assert (found["myopic"], found["mistaken"]) == (Teacher(discount=0.9), Teacher(mistakes=0.1, seed=3))
+    learner = bayespbrl.Learner("gridworld", expert="skipping", iterations=3, **options)
+    expert = expert_of(learner)
+    learner.run(expert)
+    assert expert_of(learner) == expert  # continued, it is the same

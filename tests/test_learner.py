@@ -90,7 +90,7 @@ def test_the_first_iteration_compares_three_of_the_new_trajectories_and_later_on
 
 
 DRAWS = {"utility": "posterior-mean", "hyperparameters": "given", "iterations": 2}
-POSTERIOR_RULES = ("probably-better", "thompson", "information", "disagreement")
+POSTERIOR_RULES = ("probably-better", "thompson", "information", "disagreement", "eubo")
 
 
 @pytest.mark.parametrize("query", POSTERIOR_RULES)

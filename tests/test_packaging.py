@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 LINKS = ("models", "diagnostics", "envs")
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "bayespbrl").rglob("*.py")}
 TEMPLATES = {f"bayespbrl/diagnostics/report/templates/report.{form}.jinja" for form in ("html", "md")}
+TEMPLATES |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "bayespbrl/studies/declared").glob("*.toml")}
 
 
 @pytest.fixture(scope="module")

@@ -111,6 +111,8 @@ def test_rules_order_the_same_draws_each_in_its_way():
     assert order("probably-better", DRAWS, ZERO) == (1, 2, 0)
     # variances of the order 3/16, 3/16, 1/4: the even match first, then the equal ones by their mean
     assert order("disagreement", DRAWS, ZERO) == (2, 0, 1)
+    # the mean of the better of the two: 9/4, 3/4, 4/4
+    assert order("eubo", DRAWS, ZERO) == (0, 2, 1)
     # a logistic answer at ±1 is a vague one; at ±2 and evenly split it tells most
     assert order("information", DRAWS, ZERO)[0] == 2
 

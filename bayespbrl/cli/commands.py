@@ -1,8 +1,9 @@
-"""The command line: `bayespbrl run`, `resume`, `ask`, `report`, `trials`."""
+"""The command line: `bayespbrl run`, `resume`, `ask`, `report`, `trials`, `study`, `results`."""
 
 import inspect
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -19,10 +20,13 @@ from bayespbrl.cli.display import (
     show_run,
     show_trials,
 )
+from bayespbrl.cli.studies import run_study, show_plan
+from bayespbrl.experts import SIMULATED
 from bayespbrl.runs.directory import fresh_directory
 from bayespbrl.runs.lock import continuing
 from bayespbrl.settings import OPTIONS, PARTS, Settings
-from bayespbrl.studies import run_trials
+from bayespbrl.studies import Study, declared, run_trials
+from bayespbrl.studies.cluster import scheduler_executor
 
 app = typer.Typer(
     help="Preference-based reinforcement learning: a policy from answers to 'which of these two is better?'.",
@@ -45,7 +49,7 @@ RUN_OPTIONS = {
     "utility": "Estimate of the utility: posterior-mean, most-likely, posterior-draw, linear-program, or known-reward "
     "(a reference run trained on the hidden reward).",
     "query": "Rule that selects the trajectories to ask about: information-when-unsure (default), highest-utility (the "
-    "paper's), probably-better, thompson, information or disagreement.",
+    "paper's), probably-better, thompson, information, disagreement or eubo (expected utility of the best option).",
     "schedule": "KL bound of each update: confidence (default), which scales it with the confidence that the update is "
     "an improvement, or constant (the paper's).",
     "hyperparameters": "Length scales, steepness and lapse rate: inferred (part of the posterior, unless --steepness "
@@ -71,7 +75,9 @@ RUN_OPTIONS = {
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
     "repeats": "Share of the questions that are an earlier one with sides swapped, which shows how consistent a person "
     "is; 0.1 for people, 0 for a simulated expert.",
-    "expert": "Who answers: return (simulated), page (you, in a browser) or terminal (you, at the prompt).",
+    "expert": "Who answers: return (simulated, always right), page (you, in a browser), terminal (you, at the prompt), "
+    "or a simulated expert who errs: stochastic, myopic, skipping, equal, mistaken (B-Pref's teachers) or margin (that "
+    "of Programming by Feedback).",
 }
 
 
@@ -135,9 +141,9 @@ def ask(
         learner = runs.resume(directory)
         if learner.finished:
             raise ValueError(f"{directory}: this run is finished; there is nothing left to ask")
-        if learner.settings.expert == "return":
+        if (expert := learner.settings.expert) in SIMULATED:
             raise ValueError(
-                f"expert: expected a run that a person answers, got return, the simulated one: {directory}"
+                f"expert: expected a run that a person answers, got {expert}, a simulated one: {directory}"
             )
         ask_on_page(learner, directory, answers=answers, answerer=answerer, host=host, port=port)
 
@@ -178,6 +184,51 @@ def trials(
             raise
         bar.update(task, completed=number)
     show_trials(study)
+
+
+Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://host:8786.")]
+
+
+@app.command()
+def study(
+    name: Annotated[str, typer.Argument(help="A shipped study, or a TOML file.", metavar="NAME|FILE.toml")],
+    *,
+    number: Annotated[int | None, typer.Option("--trials", help="Trials of each row; as declared if omitted.")] = None,
+    jobs: Annotated[int, typer.Option(help="Number of trials at a time, each in its own process.")] = 1,
+    scheduler: Scheduler = None,
+    out: Annotated[Path | None, typer.Option(help="Directory of the study; runs/study-NAME if omitted.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say how many cells there are, and how long.")
+    ] = False,
+) -> None:
+    """Run a declared study: tasks, methods, noise, seeds. Finished cells are not repeated."""
+    checks.whole("jobs", jobs)
+    declaration = declared(name)
+    prepared = Study.prepare(declaration, out or Path("runs") / f"study-{declaration.name}", trials=number)
+    show_plan(prepared, jobs)
+    if dry_run:
+        return
+    options = f" --trials {number}" if number is not None else ""
+    options += f" --scheduler {scheduler}" if scheduler else f" --jobs {jobs}"
+    with scheduler_executor(scheduler) if scheduler else nullcontext(jobs) as where:
+        failures = run_study(prepared, where, f"bayespbrl study {name}{options}")
+    if failures:
+        raise ValueError(f"{len(failures)} of {prepared.cells} trials failed; the first: {failures[0]}")
+
+
+@app.command()
+def results(
+    directories: Annotated[list[Path], typer.Argument(help="Directories of studies.", metavar="DIR...")],
+    *,
+    out: Annotated[Path | None, typer.Option(help="Where to write; into each study's directory if omitted.")] = None,
+) -> None:
+    """Write tables (Markdown, CSV) and figures of studies, with intervals and counted comparisons."""
+    from bayespbrl.results import write_results
+
+    for directory in directories:
+        folder = out / directory.name if out is not None and len(directories) > 1 else out
+        page, *others = write_results(directory, folder)
+        console.print(f"Results: {page}; {', '.join(path.name for path in others)}")
 
 
 def main() -> None:

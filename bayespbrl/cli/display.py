@@ -9,9 +9,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
 from bayespbrl.envs.opening import environment_attribute, open_environment
-from bayespbrl.experts import TerminalExpert, simulated_expert
+from bayespbrl.experts import TerminalExpert
 from bayespbrl.learner import Learner
 from bayespbrl.runs.film import film_policy
+from bayespbrl.runs.simulated import expert_of
 from bayespbrl.studies import Trials
 from bayespbrl.trajectories import Trajectory
 
@@ -115,7 +116,7 @@ def _run_with_bar(learner: Learner) -> None:
         total, done = learner.settings.most_iterations, learner.state.iteration
         task = bar.add_task("iterations", total=total, completed=done, state=_state(learner))
         learner.run(
-            simulated_expert(learner.settings.wrong_answers, seed=learner.settings.seed),
+            expert_of(learner),
             progress=lambda now: bar.update(task, completed=now.state.iteration, state=_state(now)),
         )
         ended = learner.state.iteration  # before the limit, where the answers are used up

@@ -12,6 +12,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 
 from bayespbrl import checks
+from bayespbrl.experts import SIMULATED
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR
 
 NAMES = ("default", "paper")
@@ -159,7 +160,7 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     if checks.one_of("preset", chosen.get("preset", "default"), NAMES) == "paper":
         return {"hyperparameters": "given"} | PAPER.get(name, {})
     options = DEFAULT | ({} if task is None else task.derived()) | TASKS.get(name, {})
-    if chosen.get("expert", "return") != "return":
+    if chosen.get("expert", "return") not in SIMULATED:
         options["repeats"] = REPEATS
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":
         options["query"] = "highest-utility"

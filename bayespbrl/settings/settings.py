@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 from bayespbrl import checks
+from bayespbrl.experts import SIMULATED
 from bayespbrl.features import RadialBasisOptions
 from bayespbrl.improvement.problem import PolicyUpdate
 from bayespbrl.improvement.q_function import Critic
@@ -132,7 +133,7 @@ class Settings:
         elif self.questions.answers is None:
             raise ValueError("iterations: expected a number without a budget of answers, got None")
         checks.one_of("environment", self.environment, ("named", "other"))
-        checks.one_of("expert", self.expert, ("return", "terminal", "page", "other"))
+        checks.one_of("expert", self.expert, (*SIMULATED, "page", "terminal", "other"))
         checks.share("wrong_answers", self.wrong_answers)
         self._check_together()
 

@@ -1,36 +1,128 @@
-"""Processes for the trials of a study, which end when the study ends."""
+"""Processes for the trials of a study: each runs one trial at a time, dies alone, and ends when the study ends."""
 
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import Any
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+class TrialProcesses(Executor):
+    """An executor of `jobs` spawned processes. One that dies fails its own call with `BrokenExecutor`, and no other.
+
+    Decision: the next call of its slot gets a new process; otherwise a process is kept from call to call. To compile
+    JAX's functions anew takes 16 s a trial, 8 s with JAX's cache on disk, of about a minute that a short trial takes.
+    """
+
+    def __init__(self, jobs: int):
+        self._slots = threading.local()
+        self._lock = threading.Lock()
+        self._processes: set[_Process] = set()
+        self._ended = False
+        self._threads = ThreadPoolExecutor(jobs)
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        """Call `function`, which has to be importable, in one of the processes."""
+        return self._threads.submit(self._call, function, arguments, named)
+
+    def _call(self, function: Callable[..., Any], arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
+        process: _Process | None = getattr(self._slots, "process", None)
+        if process is None:
+            with self._lock:
+                if self._ended:
+                    raise BrokenExecutor("the study has ended")
+                process = self._slots.process = _Process()
+                self._processes.add(process)
+        try:
+            result, error = process.call(function, arguments, named)
+        except (EOFError, OSError) as gone:
+            self._slots.process = None
+            with self._lock:
+                self._processes.discard(process)
+            raise BrokenExecutor(f"its process ended ({process.end()})") from gone
+        if error is not None:
+            raise error
+        return result
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes: after their calls, or at once without `wait`."""
+        if wait:
+            self._threads.shutdown(wait=True, cancel_futures=cancel_futures)
+        with self._lock:
+            self._ended = True
+            processes = list(self._processes)
+        for process in processes:
+            process.terminate()
+        self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
+
+
+class _Process:
+    """A spawned process that answers calls over a pipe."""
+
+    def __init__(self) -> None:
+        self._ours, theirs = _SPAWN.Pipe()
+        self._process = _SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()  # so that the pipe ends when the process does
+
+    def call(self, *call: Any) -> tuple[Any, Exception | None]:
+        """The result of a call, or the exception that it raised; `EOFError` or `OSError` where the process dies."""
+        self._ours.send(call)
+        outcome: tuple[Any, Exception | None] = self._ours.recv()
+        return outcome
+
+    def end(self) -> str:
+        """How it ended, in words."""
+        self._process.join(timeout=10)
+        code = self._process.exitcode
+        return f"signal {-code}" if code is not None and code < 0 else f"exit status {code}"
+
+    def terminate(self) -> None:
+        self._process.terminate()
+
+
+def _serve(calls: Connection) -> None:
+    _end_with_parent()
+    while True:
+        try:
+            function, arguments, named = calls.recv()
+        except EOFError:
+            return
+        try:
+            outcome: tuple[Any, Exception | None] = (function(*arguments, **named), None)
+        except (ValueError, OSError, MemoryError) as error:
+            outcome = None, type(error)(str(error)) if type(error) in (ValueError, MemoryError) else _plain(error)
+        except Exception as error:  # not every exception can be sent
+            outcome = None, RuntimeError(f"{type(error).__name__}: {error}")
+        calls.send(outcome)
+
+
+def _plain(error: Exception) -> Exception:
+    """An error of a subclass, as what can be sent."""
+    return OSError(*error.args) if isinstance(error, OSError) else ValueError(str(error))
 
 
 @contextmanager
-def trial_processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of `jobs` spawned processes, each with a single thread where there are several.
+def trial_processes(jobs: int) -> Iterator[Executor]:
+    """`TrialProcesses`, each with a single thread where there are several.
 
     Where the block raises, the processes are terminated at once: a trial continues from disk when it is called again.
     """
-    others = set(multiprocessing.active_children())
-    with (
-        _environment(ONE_THREAD if jobs > 1 else {}),
-        ProcessPoolExecutor(
-            jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
-        ) as pool,
-    ):
+    with _environment(ONE_THREAD if jobs > 1 else {}):
+        pool = TrialProcesses(jobs)
         try:
             yield pool
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in set(multiprocessing.active_children()) - others:
-                process.terminate()
             raise
+        pool.shutdown()
 
 
 def _end_with_parent() -> None:

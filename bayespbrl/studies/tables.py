@@ -18,6 +18,7 @@ from bayespbrl.runs.files import write_file, written_aside
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value", "value_newest")
 
 BALANCING_FILE = "balancing.json"
+FIRST_POLICY_FILE = "first-policy.json"  # of a trial that does not learn: the random policy
 
 
 def collect(directories: Sequence[Path | str]) -> xr.Dataset:
@@ -105,6 +106,28 @@ def measure_balancing(learner: Learner, directory: Path, *, max_steps: int, epis
         "terminated": float(lasted.terminated.mean()),
     }
     write_file(directory / BALANCING_FILE, json.dumps(content, indent=1) + "\n")
+
+
+def has_first_policy(directory: Path | str) -> bool:
+    """Whether `measure_first_policy` has written its file into a run directory."""
+    return (Path(directory) / FIRST_POLICY_FILE).exists()
+
+
+def measure_first_policy(learner: Learner, directory: Path) -> None:
+    """Measure the value of a learner's first policy, which is random, as an iteration's; in `first-policy.json`."""
+    returned = learner.cycle.evaluated(learner.first_policy())
+    content = {"episodes": len(returned.total), "value": float(returned.total.mean())}
+    write_file(directory / FIRST_POLICY_FILE, json.dumps(content, indent=1) + "\n")
+
+
+def collect_first_policies(directories: Sequence[Path | str], env: str) -> xr.Dataset:
+    """The values of first policies as one data set over (seed, iteration), the iteration being 0."""
+    values = [json.loads((Path(path) / FIRST_POLICY_FILE).read_text())["value"] for path in directories]
+    seeds = [int(Path(path).name.rpartition("-")[2]) for path in directories]
+    column = np.array(values)[:, None]
+    names = {"value": column, "value_newest": column, "answers": np.zeros_like(column, dtype=int)}
+    variables = {name: (("seed", "iteration"), entries) for name, entries in names.items()}
+    return xr.Dataset(variables, {"seed": seeds, "iteration": [0]}, {"env": env, "utility": "none"})
 
 
 def write_tables(table: xr.Dataset, directory: Path) -> None:

@@ -9,6 +9,7 @@ from bayespbrl.diagnostics.people import people
 from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.document import Body, ReportWarning, Table
 from bayespbrl.diagnostics.report.formatting import count, number, percent
+from bayespbrl.experts import SIMULATED
 
 # A lapse rate that is surely above the first is worth less trust; above the second the answers are worth little.
 LESS_TRUST, LITTLE_WORTH = 0.1, 0.5
@@ -19,7 +20,7 @@ HASTY, FEW, MANY = 1.0, 5, 0.3  # seconds; answers that say something about a pe
 def has_people(contents: RunContents) -> bool:
     """Whether people answered: some answer has a name, or the expert is no simulation."""
     named = any(question.answerer is not None for question in contents.past)
-    return bool(contents.past) and (named or contents.settings.expert != "return")
+    return bool(contents.past) and (named or contents.settings.expert not in SIMULATED)
 
 
 def people_section(contents: RunContents) -> Body:

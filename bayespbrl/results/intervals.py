@@ -1,0 +1,137 @@
+"""Estimates with their intervals: medians, differences, answers needed, failed trials, performance profiles, p values.
+
+All intervals are 95 % intervals. Bootstrap intervals are percentile intervals over the trials, from 10 000 resamples of
+a fixed stream, so that the same data give the same table.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+LEVEL = 0.95
+RESAMPLES = 10_000
+PROFILE_RESAMPLES = 2_000
+
+
+class Interval(NamedTuple):
+    """An estimate and its 95 % interval."""
+
+    estimate: float
+    low: float
+    high: float
+
+
+def resamples(number: int, *, samples: int = RESAMPLES) -> np.ndarray:
+    """Bootstrap rows, the same for the same number of trials, shape (samples, number)."""
+    return np.random.default_rng(0).integers(number, size=(samples, number))
+
+
+def median_interval(values: np.ndarray) -> Interval:
+    """The median of values of shape (S,) with its bootstrap interval; NaN bounds for a single value."""
+    values = np.asarray(values, dtype=np.float64)
+    estimate = float(np.median(values))
+    if len(values) < 2:
+        return Interval(estimate, np.nan, np.nan)
+    if np.ptp(values) == 0:
+        return Interval(estimate, estimate, estimate)
+    found = stats.bootstrap(
+        (values,),
+        np.median,
+        confidence_level=LEVEL,
+        n_resamples=RESAMPLES,
+        method="percentile",
+        random_state=np.random.default_rng(0),
+    ).confidence_interval
+    return Interval(estimate, float(found.low), float(found.high))
+
+
+def paired_difference(values: np.ndarray, reference: np.ndarray) -> tuple[Interval, float]:
+    """Median difference of paired trials with its interval, and the p value of Wilcoxon's signed-rank test.
+
+    Args:
+      values, reference: of the same seeds, shape (S,).
+    """
+    differences = np.asarray(values, dtype=np.float64) - np.asarray(reference, dtype=np.float64)
+    if len(differences) < 2 or not np.any(differences):
+        return median_interval(differences), 1.0
+    return median_interval(differences), float(stats.wilcoxon(differences, zero_method="pratt").pvalue)
+
+
+def failed_trials(failed: int, trials: int) -> Interval:
+    """The share of failed trials with its exact interval (Clopper & Pearson 1934)."""
+    bounds = stats.binomtest(failed, trials).proportion_ci(LEVEL, method="exact")
+    return Interval(failed / trials, float(bounds.low), float(bounds.high))
+
+
+def answers_for_good(answers: np.ndarray, values: np.ndarray, level: float, quantile: float = 0.5) -> Interval:
+    """Answers from which on a quantile over the trials is at least `level`, for good: it never falls below again.
+
+    Args:
+      answers: numbers of answers, shape (n,), increasing.
+      values: of each trial's last policy with no more answers, shape (S, n).
+      level: of the value.
+      quantile: over the trials; 0.5 is the median.
+
+    Returns:
+      infinity where the quantile is below `level` at the end, as bounds too.
+    """
+
+    def needed(values: np.ndarray) -> np.ndarray:
+        reached = np.quantile(values, quantile, axis=-2) >= level
+        for_good = np.flip(np.logical_and.accumulate(np.flip(reached, -1), axis=-1), -1)
+        return np.where(for_good[..., -1], answers[for_good.argmax(axis=-1)], np.inf)
+
+    if len(values) < 2:
+        return Interval(float(needed(values)), np.nan, np.nan)
+    tail = (1 - LEVEL) / 2
+    low, high = np.quantile(needed(values[resamples(len(values))]), [tail, 1 - tail], method="inverted_cdf")
+    return Interval(float(needed(values)), float(low), float(high))
+
+
+def holm(p: Sequence[float]) -> np.ndarray:
+    """p values adjusted for their number, controlling the family-wise error rate (Holm 1979), in their order."""
+    values = np.asarray(p, dtype=np.float64)
+    order = np.argsort(values, kind="stable")
+    adjusted = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1.0)
+    result = np.empty_like(values)
+    result[order] = adjusted
+    return result
+
+
+def benjamini_hochberg(p: Sequence[float]) -> np.ndarray:
+    """p values adjusted for their number, controlling the false discovery rate (Benjamini & Hochberg 1995)."""
+    return np.asarray(stats.false_discovery_control(np.asarray(p, dtype=np.float64))) if len(p) else np.empty(0)
+
+
+class Profile(NamedTuple):
+    """A performance profile: share of runs above each level, with the pointwise interval; shapes (n,)."""
+
+    levels: np.ndarray
+    share: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def performance_profile(relative: Mapping[str, np.ndarray], levels: np.ndarray) -> Profile:
+    """The share of runs whose relative value is above each level, averaged over tasks.
+
+    Args:
+      relative: final relative values of each task's trials, shape (S,) each.
+      levels: shape (n,).
+
+    Returns:
+      the profile with its stratified bootstrap interval: trials are drawn anew within each task.
+
+    Source: Agarwal, Schwarzer, Castro, Courville & Bellemare (2021), "Deep reinforcement learning at the edge of the
+    statistical precipice", section 4.2, eq. 2.
+    """
+    shares, samples = [], []
+    for values in relative.values():
+        above = np.asarray(values, dtype=np.float64)[:, None] > levels
+        shares.append(above.mean(axis=0))
+        samples.append(above[resamples(len(values), samples=PROFILE_RESAMPLES)].mean(axis=1))
+    tail = (1 - LEVEL) / 2
+    low, high = np.quantile(np.mean(samples, axis=0), [tail, 1 - tail], axis=0)
+    return Profile(levels, np.mean(shares, axis=0), low, high)

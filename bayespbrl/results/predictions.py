@@ -1,0 +1,39 @@
+"""Each answer of a study's runs with the probability that the learner gave it beforehand: `answers.csv`."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bayespbrl.diagnostics.report.contents import read_contents
+from bayespbrl.preferences import Answer
+from bayespbrl.results.study_data import ANSWER_COLUMNS
+from bayespbrl.runs.files import written_aside
+from bayespbrl.studies.study import Study
+
+
+def write_predictions(study: Study) -> Path:
+    """Write `answers.csv` of the finished trials: predictions by the posterior at the time of the question.
+
+    The first iteration, which has no posterior, and answers that state no preference are left out.
+    """
+    lines = [
+        [*declared.levels, seed, *answer]
+        for declared, seeds in zip(study.declaration.rows, study.rows, strict=True)
+        if not declared.untrained
+        for seed in seeds.with_outcome(True)
+        for answer in _predicted(seeds.row.path(seed))
+    ]
+    file = study.directory / "answers.csv"
+    with written_aside(file) as aside:
+        table = pd.DataFrame(lines, columns=ANSWER_COLUMNS)
+        table.to_csv(aside, index=False, lineterminator="\n", float_format="%.6g")
+    return file
+
+
+def _predicted(run: Path) -> list[tuple[int, int, float, bool]]:
+    return [
+        (answer.question, answer.iteration, answer.predicted, answer.answer is Answer.FIRST)
+        for answer in read_contents(run).answers
+        if answer.iteration > 1 and answer.row is not None and np.isfinite(answer.predicted)
+    ]

@@ -1,0 +1,154 @@
+"""The data of a study: its description, its declaration, a line for each iteration, and each predicted answer.
+
+They are read from a study's directory, or from a copy of these four files alone: `study.json`, `study.toml`,
+`iterations.csv`, `answers.csv`.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bayespbrl.studies.declaration import AXES, Declaration, DeclaredRow, parsed
+from bayespbrl.studies.study import FIGURES, read_study_json
+from bayespbrl.studies.tables import by_answers
+
+ITERATION_COLUMNS = [*AXES, "seed", "iteration", *FIGURES]
+ANSWER_COLUMNS = [*AXES, "seed", "question", "iteration", "predicted", "first"]
+
+
+@dataclass(frozen=True)
+class RowData:
+    """The trials of one row.
+
+    Attributes:
+      declared: the row.
+      seeds: of the finished trials, in increasing order.
+      answers: numbers of answers, increasing, from the smallest that every trial has a policy for, shape (n,).
+      values: of each trial's last policy with no more answers, shape (S, n).
+      used: answers of each trial in all, shape (S,).
+      final: value of each trial at its end, shape (S,).
+      lines: the iterations, all columns.
+    """
+
+    declared: DeclaredRow
+    seeds: tuple[int, ...]
+    answers: np.ndarray
+    values: np.ndarray
+    used: np.ndarray
+    final: np.ndarray
+    lines: pd.DataFrame
+
+    def at(self, answers: float) -> np.ndarray | None:
+        """Value of each trial after so many answers; None where some trial has no policy by then."""
+        reached = np.flatnonzero(self.answers <= answers)
+        return self.values[:, reached[-1]] if len(reached) else None
+
+
+@dataclass(frozen=True)
+class StudyData:
+    """The data of a study.
+
+    Attributes:
+      path: where they are.
+      description: `study.json`.
+      declaration: `study.toml`.
+      rows: those with finished trials, in the order of the declaration.
+      predicted: each predicted answer, columns `ANSWER_COLUMNS`; None without `answers.csv`.
+    """
+
+    path: Path
+    description: dict[str, Any]
+    declaration: Declaration
+    rows: tuple[RowData, ...]
+    predicted: pd.DataFrame | None
+
+    @property
+    def name(self) -> str:
+        return self.declaration.name
+
+    @property
+    def tasks(self) -> list[str]:
+        """The tasks with finished trials, in the order of the declaration."""
+        return list(dict.fromkeys(row.declared.levels[0] for row in self.rows))
+
+    def of_task(self, task: str) -> list[RowData]:
+        """The rows of a task."""
+        return [row for row in self.rows if row.declared.levels[0] == task]
+
+    def floor_and_ceiling(self, task: str) -> tuple[float, float] | None:
+        """Median value of the random policy and, at its end, of the reference run on the hidden reward.
+
+        None where the study has no such rows, or the two are not in this order.
+        """
+        rows = self.of_task(task)
+        floors = [row.final for row in rows if row.declared.untrained]
+        ceilings = [row.final for row in rows if row.declared.options.get("utility") == "known-reward"]
+        if not floors or not ceilings:
+            return None
+        floor = float(np.median(np.concatenate(floors)))
+        ceiling = max(float(np.median(values)) for values in ceilings)
+        return (floor, ceiling) if ceiling > floor else None
+
+    @property
+    def source(self) -> str:
+        """Study, command, version, date and machine, for the caption of a table."""
+        kept = self.description
+        return (
+            f"Study `{self.name}` (`{kept.get('command')}`), version {kept.get('version')} (source "
+            f"{kept.get('source')}), {kept.get('date')}, {kept.get('machine')}."
+        )
+
+
+def read_study(directory: Path | str) -> StudyData:
+    """The data in a directory.
+
+    Raises:
+      ValueError: no study, or a damaged file.
+    """
+    directory = Path(directory)
+    description = read_study_json(directory)
+    declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
+    lines = _read(directory / "iterations.csv", ITERATION_COLUMNS)
+    answers = directory / "answers.csv"
+    rows = []
+    for declared in declaration.rows:
+        chosen = np.logical_and.reduce(
+            [lines[axis] == level for axis, level in zip(AXES, declared.levels, strict=True)]
+        )
+        if chosen.any():
+            rows.append(_row(declared, lines[chosen]))
+    if not rows:
+        raise ValueError(f"{directory}: expected finished trials in iterations.csv, got none")
+    predicted = _read(answers, ANSWER_COLUMNS) if answers.exists() else None
+    return StudyData(directory, description, declaration, tuple(rows), predicted)
+
+
+def _read(file: Path, columns: list[str]) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(file, dtype=dict.fromkeys(AXES, str), keep_default_na=True)
+    except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
+        raise ValueError(f"{file}: expected a table, got {' '.join(str(error).split())}") from error
+    if missing := [name for name in columns if name not in table]:
+        raise ValueError(f"{file}: expected the columns {', '.join(columns)}, got none of {', '.join(missing)}")
+    table[list(AXES)] = table[list(AXES)].fillna("")
+    for name in ("seed", "iteration", "answers", "value", "predicted"):
+        if len(table) and name in table and not pd.api.types.is_numeric_dtype(table[name]):
+            raise ValueError(f"{file}: expected numbers as {name}, got {table[name].dtype}")
+    return table
+
+
+def _row(declared: DeclaredRow, lines: pd.DataFrame) -> RowData:
+    lines = lines.sort_values(["seed", "iteration"])
+    grouped = [trial for _, trial in lines.groupby("seed")]
+    longest = max(len(trial) for trial in grouped)
+
+    def padded(name: str) -> np.ndarray:  # a trial that ended earlier keeps its last figures
+        return np.array([np.pad(trial[name].values, (0, longest - len(trial)), mode="edge") for trial in grouped])
+
+    answers, values = padded("answers"), padded("value")
+    numbers, reached = by_answers(answers, values)
+    seeds = tuple(int(trial["seed"].iloc[0]) for trial in grouped)
+    return RowData(declared, seeds, numbers, reached, answers[:, -1], values[:, -1], lines)

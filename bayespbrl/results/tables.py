@@ -1,0 +1,194 @@
+"""The tables of a study: values with their intervals, what the runs were like, calibration of the predicted answers."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+
+from bayespbrl.diagnostics import score_predictions
+from bayespbrl.results.intervals import (
+    Interval,
+    answers_for_good,
+    benjamini_hochberg,
+    failed_trials,
+    holm,
+    median_interval,
+    paired_difference,
+)
+from bayespbrl.results.study_data import RowData, StudyData
+from bayespbrl.studies.declaration import AXES
+
+REACHED = 0.95  # of the relative value, (value − random policy) / (known reward − random policy)
+FAILED_BELOW = 0.5  # of the relative value, where the task declares no `failed_below`
+SURE = 0.95
+MISSING = "–"
+
+
+def values_table(data: StudyData) -> pd.DataFrame:
+    """A line for each row: what the trials end at, and how they differ from the first row of their task.
+
+    All comparisons are at the same number of answers on both sides, over shared seeds, and their p values are adjusted
+    for the number of comparisons in the table (Holm); `false discovery` has Benjamini and Hochberg's.
+    """
+    lines: list[dict[str, str]] = []
+    p: list[tuple[int, float]] = []
+    for task in data.tasks:
+        rows, scale = data.of_task(task), data.floor_and_ceiling(task)
+        learned = [row for row in rows if not row.declared.untrained]
+        for row in rows:
+            line = _of_trials(row, scale, data.declaration.report_at)
+            if learned and row is not learned[0] and row in learned:
+                difference, value, budget = _compared(row, learned[0])
+                line |= {"difference": difference, "at answers": budget}
+                p.append((len(lines), value))
+            lines.append(line)
+    table = pd.DataFrame(lines)
+    compared = [(place, value) for place, value in p if np.isfinite(value)]
+    for name, adjust in (("p (Holm)", holm), ("false discovery", benjamini_hochberg)):
+        table[name] = MISSING
+        for (place, _), value in zip(compared, adjust([value for _, value in compared]), strict=True):
+            table.loc[place, name] = f"{value:.2g}"
+    return table.reindex(columns=_present(table)).fillna(MISSING)
+
+
+def _present(table: pd.DataFrame) -> list[str]:
+    """The columns, without axes that the study does not have."""
+    return [name for name in table.columns if name not in AXES or table[name].ne("").any()]
+
+
+def _of_trials(row: RowData, scale: tuple[float, float] | None, report_at: tuple[int, ...]) -> dict[str, str]:
+    quartiles = np.quantile(row.final, [0.25, 0.75])
+    values = [None if row.declared.untrained else row.at(number) for number in report_at]
+    line = dict(zip(AXES, row.declared.levels, strict=True)) | {
+        "trials": str(len(row.final)),
+        "answers": f"{np.median(row.used):g}",
+        **{
+            f"after {number}": MISSING if value is None else f"{np.median(value):.4g} [{np.quantile(value, 0.25):.4g}]"
+            for number, value in zip(report_at, values, strict=True)
+        },
+        "median": f"{np.median(row.final):.4g}",
+        "quartiles": f"{quartiles[0]:.4g} … {quartiles[1]:.4g}",
+        "interval of the median": _bounds(median_interval(row.final)),
+        "relative value": MISSING,
+        f"answers to {REACHED} for good": MISSING,
+        "failed": MISSING,
+        "exact interval": MISSING,
+    }
+    level = row.declared.failed_below
+    if scale is not None:
+        floor, ceiling = scale
+        line["relative value"] = f"{(np.median(row.final) - floor) / (ceiling - floor):.3f}"
+        level = floor + FAILED_BELOW * (ceiling - floor) if level is None else level
+        if not row.declared.untrained:
+            needed = answers_for_good(row.answers, row.values, floor + REACHED * (ceiling - floor))
+            line[f"answers to {REACHED} for good"] = _with_bounds(needed, _number)
+    if level is not None and not row.declared.untrained:
+        failed = int(np.sum(row.final < level))
+        line["failed"] = f"{failed} of {len(row.final)}"
+        line["exact interval"] = _bounds(failed_trials(failed, len(row.final)), "{:.2f}")
+    return line
+
+
+def _compared(row: RowData, reference: RowData) -> tuple[str, float, str]:
+    """The paired difference to the reference after as many answers as all trials of both gave; p; that number."""
+    shared = sorted(set(row.seeds) & set(reference.seeds))
+    budget = int(min(row.used.min(), reference.used.min()))
+    both = row.at(budget), reference.at(budget)
+    if not shared or both[0] is None or both[1] is None:
+        return MISSING, np.nan, MISSING
+    values, before = (
+        part[[side.seeds.index(seed) for seed in shared]] for part, side in ((both[0], row), (both[1], reference))
+    )
+    difference, p = paired_difference(values, before)
+    return _with_bounds(difference, lambda number: f"{number:+.3g}"), p, str(budget)
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if np.isfinite(value) else "never"
+
+
+def _with_bounds(interval: Interval, shown: Callable[[float], str]) -> str:
+    if np.isnan(interval.low):
+        return shown(interval.estimate)
+    return f"{shown(interval.estimate)} [{shown(interval.low)}, {shown(interval.high)}]"
+
+
+def _bounds(interval: Interval, form: str = "{:.4g}") -> str:
+    if np.isnan(interval.low):
+        return MISSING
+    return f"[{form.format(interval.low)}, {form.format(interval.high)}]"
+
+
+def runs_table(data: StudyData) -> pd.DataFrame:
+    """A line for each row: the settings, and whether its fits and updates can be believed."""
+    lines = []
+    for row in data.rows:
+        if row.declared.untrained:
+            continue
+        seen = row.lines
+        options = " ".join(f"{name}={value}" for name, value in sorted(row.declared.options.items()))
+        share = seen["kl"] / seen["kl_bound"]
+        lines.append(
+            dict(zip(AXES, row.declared.levels, strict=True))
+            | {
+                "settings": options or "the default",
+                "fits": str(len(seen)),
+                "not converged": str(int((seen["converged"].astype(str) != "True").sum())),
+                "worst R̂": _of(seen["rhat"].max(), "{:.3f}"),
+                "least ESS": _of(seen["effective_sample_size"].min(), "{:.0f}"),
+                "signal": _of(seen["signal"].median(), "{:.2f}"),
+                "KL": _of(seen["kl"].median(), "{:.3f}"),
+                "most KL/bound": _of(share.max(), "{:.2f}"),
+                "minutes a trial": _of(seen.groupby("seed")["seconds"].sum().median() / 60, "{:.2g}"),
+            }
+        )
+    table = pd.DataFrame(lines)
+    return table.reindex(columns=_present(table)) if len(table) else table
+
+
+def _of(value: float, form: str) -> str:
+    return MISSING if pd.isna(value) else form.format(value)
+
+
+def calibration_table(data: StudyData) -> pd.DataFrame:
+    """A line for each row with a posterior: how well it predicted its answers before they were given.
+
+    `z` is the log score less its expectation under the predictions themselves, in standard deviations: below −2 the
+    predictions are overconfident. The first iteration, which has no posterior, is left out.
+    """
+    lines: list[dict[str, str]] = []
+    if data.predicted is None:
+        return pd.DataFrame(lines)
+    for row in data.rows:
+        levels = row.declared.levels
+        chosen = np.logical_and.reduce([data.predicted[a] == level for a, level in zip(AXES, levels, strict=True)])
+        if chosen.any():
+            lines.append(dict(zip(AXES, levels, strict=True)) | _scores(data.predicted[chosen]))
+    table = pd.DataFrame(lines)
+    return table.reindex(columns=_present(table)) if len(table) else table
+
+
+def _scores(answers: pd.DataFrame) -> dict[str, str]:
+    predicted, observed = answers["predicted"].to_numpy(float), answers["first"].to_numpy(bool)
+    scores = score_predictions(np.clip(predicted, 0, 1), observed, simulations=1)
+    confidence = np.maximum(predicted, 1 - predicted)
+    right = np.where(predicted >= 0.5, observed, ~observed)[confidence >= SURE]
+    names = ("log_score", "log_score_expected", "log_score_sd", "log_score_z", "expected_calibration_error")
+    score, expected, deviation, z, error = (float(scores[name]) for name in names)
+    return {
+        "runs": str(answers["seed"].nunique()),
+        "answers predicted": str(len(answers)),
+        "log score": f"{score:.1f}",
+        "expected": f"{expected:.1f} ± {deviation:.1f}",
+        "z": f"{z:.1f}",
+        "ECE": f"{error:.3f}",
+        f"right of those ≥ {SURE}": f"{right.mean():.2f} (n = {len(right)})" if len(right) else MISSING,
+    }
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A table in Markdown, numbers to the right."""
+    text = [name for name in table.columns if name in AXES or name == "settings"]
+    rule = "|".join("---" if name in text else "---:" for name in table.columns)
+    rows = [" | ".join(str(value) or MISSING for value in row) for row in table.itertuples(index=False)]
+    return "\n".join([f"| {' | '.join(table.columns)} |", f"|{rule}|", *(f"| {row} |" for row in rows)])

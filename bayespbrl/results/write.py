@@ -1,0 +1,90 @@
+"""`bayespbrl results`: the tables of a study in Markdown and CSV, and its figures, beside its data."""
+
+from importlib.metadata import version
+from pathlib import Path
+
+import pandas as pd
+
+from bayespbrl.results.figures import curves_figure, profiles_figure
+from bayespbrl.results.predictions import write_predictions
+from bayespbrl.results.study_data import StudyData, read_study
+from bayespbrl.results.tables import MISSING, calibration_table, markdown, runs_table, values_table
+from bayespbrl.runs.files import write_file, written_aside
+from bayespbrl.studies.declaration import parsed
+from bayespbrl.studies.study import Study, read_study_json
+
+TITLES = {
+    "values": "Values",
+    "calibration": "Calibration of the predicted answers",
+    "runs": "Settings, convergence and updates of the runs",
+}
+
+
+def refreshed(directory: Path) -> StudyData:
+    """The data of a study, first written anew from the run directories where these are there, of this version."""
+    description = read_study_json(directory)
+    declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
+    ours = description.get("version") == version("bayespbrl")
+    if ours and any((directory / row.name).is_dir() for row in declaration.rows):
+        trials = description.get("trials")
+        study = Study.prepare(declaration, directory, trials=trials if isinstance(trials, int) else None)
+        study.write_table()
+        write_predictions(study)
+    return read_study(directory)
+
+
+def tables_of(data: StudyData) -> dict[str, pd.DataFrame]:
+    """The tables of a study by name, without those that have no line."""
+    tables = {"values": values_table(data), "calibration": calibration_table(data), "runs": runs_table(data)}
+    return {name: table for name, table in tables.items() if len(table)}
+
+
+def section(data: StudyData, name: str, table: pd.DataFrame) -> str:
+    """A table in Markdown with its source, and what its columns are."""
+    notes = {
+        "values": f"Value of the kept policy at the end of a trial. Relative value: 0 is the random policy, 1 the "
+        f"median of the reference runs on the hidden reward. Differences: median paired difference to the first row of "
+        f"the task after as many answers as all trials of both gave; p values of {_compared(table)} comparisons "
+        f"(Wilcoxon), adjusted by Holm and by Benjamini and Hochberg. Brackets: 95 % intervals, bootstrap over trials; "
+        f"of failed trials exact (Clopper and Pearson). For good: and never below again.",
+        "calibration": "Each answer was predicted before it was given. `z` below −2: overconfident, above 2: "
+        "underconfident. ECE: expected calibration error.",
+        "runs": "Fits: posteriors over all trials and iterations. ESS: effective sample size of the worst margin. "
+        "Signal, KL: medians over updates.",
+    }
+    return f"{markdown(table)}\n\n{data.source} {notes[name]}"
+
+
+def _compared(table: pd.DataFrame) -> int:
+    return int((table["p (Holm)"] != MISSING).sum()) if "p (Holm)" in table else 0
+
+
+def write_results(directory: Path | str, out: Path | str | None = None) -> list[Path]:
+    """Write `results.md`, a CSV for each table and the figures of a study.
+
+    Args:
+      directory: of the study, or of its four data files.
+      out: where to write; None: into `directory`.
+
+    Returns:
+      the files, `results.md` first.
+
+    Raises:
+      ValueError: no study, none of its trials finished, or damaged data.
+    """
+    data = refreshed(Path(directory))
+    out = Path(directory if out is None else out)
+    out.mkdir(parents=True, exist_ok=True)
+    written, sections = [], [f"# {data.declaration.title}"]
+    for name, table in tables_of(data).items():
+        written.append(out / f"{name}.csv")
+        with written_aside(written[-1]) as aside:
+            table.to_csv(aside, index=False, lineterminator="\n")
+        sections += [f"## {TITLES[name]}", section(data, name, table)]
+    for name, figure in (("curves", curves_figure(data)), ("profiles", profiles_figure(data))):
+        if figure is not None:
+            written.append(out / f"{name}.png")
+            figure.savefig(written[-1], dpi=110)
+            sections.append(f"![{name}]({name}.png)")
+    write_file(out / "results.md", "\n\n".join(sections) + "\n")
+    return [out / "results.md", *written]

@@ -1,0 +1,147 @@
+"""The engine of all studies: rows of trials through any `concurrent.futures.Executor`, until each is done or given up.
+
+A trial whose process dies continues from its run directory. A trial that raises is given up at once, since it would
+raise again. Neither ends the others.
+"""
+
+import errno
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from dataclasses import dataclass, field
+
+from bayespbrl.studies.rows import Row, Seeds, run_trial
+
+MOST_STARTS = 3  # of a trial whose process dies
+POLL = 0.5  # seconds between looks at which trials have started
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A trial that is not finished, and why."""
+
+    row: Row
+    seed: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.row.name} seed {self.seed}: {self.reason}".strip()
+
+
+@dataclass
+class Progress:
+    """Where a study stands: numbers of trials, and the seconds since it was begun or continued.
+
+    Attributes:
+      total: trials of the study, those to come in place of redrawn ones among them.
+      before: finished before this call.
+      done: finished, `before` among them; redrawn trials do not count.
+      running, failed: trials that run now, or were given up.
+      seconds: since the call.
+      latest: the trial that was finished last: its row and seed.
+    """
+
+    total: int
+    before: int = 0
+    done: int = 0
+    running: int = 0
+    failed: int = 0
+    seconds: float = 0.0
+    latest: tuple[Row, int] | None = None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """By the pace of this call so far; None before a trial of it has finished."""
+        finished = self.done - self.before
+        return None if not finished else self.seconds / finished * (self.total - self.done - self.failed)
+
+
+@dataclass
+class Engine:
+    """Runs the trials of `rows`; each `Seeds` holds the outcomes.
+
+    Attributes:
+      rows: what to run.
+      executor: where.
+      progress: called when a trial starts, ends or fails.
+      failures: trials given up.
+    """
+
+    rows: Sequence[Seeds]
+    executor: Executor
+    progress: Callable[[Progress], None] | None = None
+    failures: list[Failure] = field(default_factory=list)
+
+    def run(self) -> list[Failure]:
+        """All trials, and those that replace redrawn ones; returns the failures."""
+        self._began = time.monotonic()
+        self._state = Progress(sum(row.trials for row in self.rows))
+        self._starts: dict[tuple[int, int], int] = {}
+        self._running: dict[Future[bool], tuple[int, int]] = {}
+        self._submit_all()
+        self._state.before = self._done()
+        for place, row in enumerate(self.rows):
+            for seed in row.with_outcome(True):
+                self._report(place, seed)
+        while self._running:
+            finished = wait(self._running, timeout=POLL, return_when=FIRST_COMPLETED).done
+            for future in finished:
+                self._finish(future, *self._running.pop(future))
+            self._submit_all()
+            self._report()
+        return self.failures
+
+    def _submit_all(self) -> None:
+        """The first trial of each row, then the second of each: a study that is stopped has something of every row."""
+        new = [
+            (seed - row.row.settings.seed, place, seed) for place, row in enumerate(self.rows) for seed in row.to_do()
+        ]
+        for _, place, seed in sorted(new):
+            if (place, seed) not in self._starts:
+                self._submit(place, seed)
+
+    def _submit(self, place: int, seed: int) -> None:
+        self._starts[place, seed] = self._starts.get((place, seed), 0) + 1
+        try:
+            self._running[self.executor.submit(run_trial, self.rows[place].row, seed)] = (place, seed)
+        except (BrokenExecutor, RuntimeError) as error:  # it takes nothing more
+            self.failures.append(Failure(self.rows[place].row, seed, f"{type(error).__name__}: {error}"))
+
+    def _finish(self, future: Future[bool], place: int, seed: int) -> None:
+        row = self.rows[place]
+        try:
+            row.outcomes[seed] = future.result()
+        except (Exception, CancelledError) as error:
+            if _died(error) and self._starts[place, seed] < MOST_STARTS:
+                self._submit(place, seed)
+                return
+            reason = f"died {self._starts[place, seed]} times: {error}" if _died(error) else str(error)
+            self.failures.append(Failure(row.row, seed, reason))
+            if getattr(error, "errno", None) in NO_SPACE:
+                raise ValueError(f"the disk is full: {error}") from error
+            return
+        if row.outcomes[seed]:
+            self._report(place, seed)
+
+    def _done(self) -> int:
+        return sum(len(row.with_outcome(True)) for row in self.rows)
+
+    def _report(self, place: int | None = None, seed: int = 0) -> None:
+        if self.progress is None:
+            return
+        state = self._state
+        state.done, state.failed = self._done(), len(self.failures)
+        state.running = sum(future.running() for future in self._running)
+        state.seconds = time.monotonic() - self._began
+        state.latest = None if place is None else (self.rows[place].row, seed)
+        self.progress(state)
+
+
+def _died(error: BaseException) -> bool:
+    """Whether a trial's process ended before its trial: it may be started again."""
+    # of Dask's, which need not be installed
+    names = {kind.__name__ for kind in type(error).__mro__}
+    return isinstance(error, BrokenExecutor | CancelledError | MemoryError) or bool(
+        names & {"KilledWorker", "CommClosedError"}
+    )

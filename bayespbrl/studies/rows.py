@@ -1,0 +1,189 @@
+"""One row of a study: a task with one choice of options, its trials, and which seeds they have."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from bayespbrl import checks, runs
+from bayespbrl.envs.opening import environment_name
+from bayespbrl.learner import Learner, task_of
+from bayespbrl.rollouts import open_environment
+from bayespbrl.runs.directory import RunDirectory, read_summary
+from bayespbrl.runs.simulated import SIMULATED, expert_of
+from bayespbrl.settings import Settings, settings_for
+from bayespbrl.studies.tables import (
+    collect,
+    collect_first_policies,
+    has_balancing,
+    has_first_policy,
+    measure_balancing,
+    measure_first_policy,
+)
+
+# Trials are redrawn that meet no preference within so many iterations: all trajectories of an early acrobot may time
+# out alike (paper, "Experiments").
+PREFERENCE_WITHIN = {"bayespbrl/Acrobot-v0": 3}
+# The most steps of an episode for the balancing time of the final policy, where the task is to stay upright.
+BALANCING_STEPS = {"bayespbrl/Bicycle-v0": 3000}
+MOST_SEEDS_A_TRIAL = 10  # a study gives up after so many seeds per trial: preferences are too rare there
+
+
+@dataclass(frozen=True)
+class Row:
+    """What all trials of a row share: plain data, since it is sent to other processes.
+
+    Attributes:
+      env: a short name or a gymnasium id.
+      directory: of the row, with the run directories `seed-1000`, ….
+      settings: of the first seed, complete.
+      options: as given by the user.
+      preference_within: the number of iterations within which a trial has to meet a preference; None: no need.
+      balancing_steps: None where no balancing time is measured.
+      untrained: whether only the value of the first policy is measured, which is the random policy.
+      name: in messages, before the seed; empty for a study of one row.
+    """
+
+    env: str
+    directory: Path
+    settings: Settings
+    options: dict[str, Any]
+    preference_within: int | None
+    balancing_steps: int | None
+    untrained: bool = False
+    name: str = ""
+
+    def path(self, seed: int) -> Path:
+        return self.directory / f"seed-{seed}"
+
+    def outcome(self, seed: int) -> bool | None:
+        """Whether a trial on disk counts (True) or is redrawn (False); None for one that is not finished.
+
+        Raises:
+          ValueError: a run with other settings, or a directory that is no run.
+        """
+        path = self.path(seed)
+        if not path.exists():
+            return None
+        kept = RunDirectory.open(path)
+        if kept.settings != replace(self.settings, seed=seed):
+            raise ValueError(f"{path}: expected a trial with these settings, got others: {kept.settings}")
+        if self.untrained:
+            return True if has_first_policy(path) else None
+        if (path / "summary.json").exists() and self.redraws(read_summary(path)["iterations"]):
+            return False
+        measured = self.balancing_steps is None or has_balancing(path)
+        return True if measured and kept.finished() else None
+
+    def redraws(self, summaries: Sequence[Mapping[str, Any]]) -> bool:
+        """Whether a trial with these summaries met no preference within the iterations that it has for that."""
+        within = self.preference_within
+        return within is not None and len(summaries) >= within and summaries[within - 1]["pairs"] == 0
+
+
+def row_of(
+    env: str,
+    directory: Path,
+    options: Mapping[str, Any],
+    *,
+    seed: int,
+    preference_within: int | None = None,
+    untrained: bool = False,
+    name: str = "",
+) -> Row:
+    """A row, its settings completed and checked; its first trial has `seed`.
+
+    Raises:
+      ValueError: an unknown environment, a bad option, or an expert that is not simulated.
+    """
+    if directory.exists() and not directory.is_dir():
+        raise ValueError(f"{directory}: expected a directory for the trials, got a file")
+    if preference_within is not None:
+        checks.whole("preference_within", preference_within)
+    environment = open_environment(env)
+    identity = environment_name(environment)
+    first = settings_for(env, task=task_of(environment, options.get("max_steps")), **options, seed=seed)
+    environment.close()
+    if first.expert not in SIMULATED:
+        raise ValueError(f"expert: expected one of {', '.join(SIMULATED)}, which are simulated, got {first.expert!r}")
+    within = PREFERENCE_WITHIN.get(identity) if preference_within is None else preference_within
+    balancing = BALANCING_STEPS.get(identity)
+    return Row(env, directory, first, dict(options), within, balancing, untrained, name)
+
+
+@dataclass
+class Seeds:
+    """The outcomes of a row's seeds, from the first upwards, until `trials` of them count.
+
+    One seed is added for each that is redrawn, so the seeds do not depend on the order in which trials finish.
+    """
+
+    row: Row
+    trials: int
+    outcomes: dict[int, bool | None] = field(default_factory=dict)
+
+    def with_outcome(self, outcome: bool | None) -> list[int]:
+        return [seed for seed, reached in self.outcomes.items() if reached is outcome]
+
+    def to_do(self) -> list[int]:
+        """The seeds of unfinished trials, after adding as many new seeds as are needed.
+
+        Raises:
+          ValueError: too few trials meet a preference.
+        """
+        while len(self.outcomes) - len(redrawn := self.with_outcome(False)) < self.trials:
+            if len(self.outcomes) >= MOST_SEEDS_A_TRIAL * self.trials:
+                raise ValueError(
+                    f"{len(redrawn)} of {len(self.outcomes)} trials met no preference within "
+                    f"{self.row.preference_within} iterations: expected {self.trials} that do"
+                )
+            seed = self.row.settings.seed + len(self.outcomes)
+            self.outcomes[seed] = self.row.outcome(seed)
+        return self.with_outcome(None)
+
+
+def run_trial(row: Row, seed: int) -> bool:
+    """Run one trial to its end, from where it stopped if it was begun; returns whether it counts.
+
+    One that another process has finished in the meantime is left as it is.
+    """
+    path = row.path(seed)
+    if (known := row.outcome(seed)) is not None:
+        return known
+    learner = runs.resume(path) if path.exists() else runs.start(row.env, path, **row.options, seed=seed)
+    if row.untrained:
+        measure_first_policy(learner, path)
+        return True
+    return _trained(row, learner, path)
+
+
+def _trained(row: Row, learner: Learner, path: Path) -> bool:
+    expert = expert_of(learner)
+    while not row.redraws(learner.state.summaries) and (questions := learner.ask()):
+        learner.tell([expert(*query.trajectories) for query in questions])
+    if row.redraws(learner.state.summaries):
+        return False
+    if row.balancing_steps is not None:
+        measure_balancing(learner, path, max_steps=row.balancing_steps)
+    return True
+
+
+def seconds_of(directory: Path) -> float | None:
+    """The seconds that a finished trial took, without waiting for answers; None where that is not kept."""
+    try:
+        taken = [entry["seconds"] for entry in read_summary(directory)["iterations"]]
+        return float(sum(sum(entry.values()) for entry in taken))
+    except (ValueError, KeyError, TypeError, AttributeError, json.JSONDecodeError):
+        return None
+
+
+def collected(seeds: Seeds) -> xr.Dataset:
+    """The finished trials of a row as one data set (`tables.collect`), with the redrawn ones as attributes."""
+    paths = [seeds.row.path(seed) for seed in seeds.with_outcome(True)]
+    redrawn = seeds.with_outcome(False)
+    table = collect_first_policies(paths, seeds.row.settings.env) if seeds.row.untrained else collect(paths)
+    table.attrs |= {"redraws": len(redrawn), "redrawn_seeds": " ".join(map(str, redrawn))}
+    return table

@@ -1,0 +1,247 @@
+"""A declared study on disk: one run directory for each of its cells, a copy of what was declared, one table of all.
+
+study.toml          the declaration
+study.json          study, version, command, machine, date
+iterations.csv      a line for each trial and iteration of the finished trials
+TASK/METHOD/…/seed-1000/   the run directories
+"""
+
+import json
+import os
+import platform
+import tomllib
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import pandas as pd
+
+from bayespbrl import checks
+from bayespbrl.runs.files import write_file, written_aside
+from bayespbrl.studies.declaration import AXES, Declaration, parsed
+from bayespbrl.studies.engine import Engine, Failure, Progress
+from bayespbrl.studies.rows import Seeds, collected, row_of, seconds_of
+from bayespbrl.studies.trials import executor_for
+
+FIGURES = {
+    "answers": "answers",
+    "value": "value",
+    "value_newest": "value_newest",
+    "terminated": "terminated",
+    "converged": "utility_converged",
+    "rhat": "rhat_max",
+    "effective_sample_size": "effective_sample_size_min",
+    "signal": "schedule_signal",
+    "kl": "kl",
+    "kl_bound": "kl_bound",
+    "seconds": "seconds",
+}  # the columns of `iterations.csv` after the levels, the seed and the iteration, by the names in the summaries
+SECONDS = ("seconds_utility", "seconds_improvement", "seconds_evaluation")
+
+
+@dataclass
+class Study:
+    """A study that can be run.
+
+    Attributes:
+      declaration: what was declared.
+      directory: where it is kept.
+      trials: of each row.
+      rows: the seeds of each row of the declaration, with what is finished already.
+    """
+
+    declaration: Declaration
+    directory: Path
+    trials: int
+    rows: list[Seeds]
+
+    @classmethod
+    def prepare(cls, declaration: Declaration, directory: Path | str, *, trials: int | None = None) -> "Study":
+        """The study with the cells that its directory holds; nothing is written.
+
+        Args:
+          declaration: what to run.
+          directory: a new one, or that of this study by this version.
+          trials: of each row; None: as declared. More may be run later.
+
+        Raises:
+          ValueError: a bad option or an unknown task, by its row; a directory of something else, of other settings or
+            of another version.
+        """
+        directory = Path(directory)
+        number = declaration.trials if trials is None else checks.whole("trials", trials)
+        _check_same(declaration, directory)
+        rows = []
+        for declared in declaration.rows:
+            try:
+                row = row_of(
+                    declared.env,
+                    directory / declared.name,
+                    declared.options,
+                    seed=declaration.seed,
+                    untrained=declared.untrained,
+                    name=declared.name,
+                )
+            except ValueError as error:
+                raise ValueError(f"study {declaration.name}, {declared.name}: {error}") from error
+            seeds = Seeds(row, number)
+            seeds.to_do()
+            rows.append(seeds)
+        return cls(declaration, directory, number, rows)
+
+    @property
+    def cells(self) -> int:
+        """Trials in all."""
+        return self.trials * len(self.rows)
+
+    @property
+    def finished(self) -> int:
+        """Cells that are finished."""
+        return sum(len(row.with_outcome(True)) for row in self.rows)
+
+    def minutes_left(self) -> float | None:
+        """Minutes on one core for what is not finished; None where a row has no finished trial and declares nothing.
+
+        By the row's finished trials, else as declared.
+        """
+        total = 0.0
+        for declared, row in zip(self.declaration.rows, self.rows, strict=True):
+            left = self.trials - len(row.with_outcome(True))
+            known = [seconds_of(row.row.path(seed)) for seed in row.with_outcome(True)]
+            took = [seconds / 60 for seconds in known if seconds is not None]
+            each = 0.0 if declared.untrained else fmean(took) if took else declared.minutes
+            if left and each is None:
+                return None
+            total += left * (each or 0.0)
+        return total
+
+    def run(
+        self,
+        jobs: int | Executor = 1,
+        *,
+        command: str = "",
+        progress: Callable[[Progress], None] | None = None,
+    ) -> list[Failure]:
+        """Run what is not finished, and write the tables.
+
+        Args:
+          jobs: trials at a time, in processes of this machine; or an executor, whose workers see the same directory.
+          command: what the study was started with, to be kept.
+          progress: called as the study goes on.
+
+        Returns:
+          the trials that were given up; all others are finished.
+        """
+        with executor_for(jobs) as executor:
+            self._write_declaration(command)
+            failures = Engine(self.rows, executor, progress).run()
+        self.write_table()
+        return failures
+
+    def _write_declaration(self, command: str) -> None:
+        self.directory.mkdir(parents=True, exist_ok=True)
+        write_file(self.directory / "study.toml", self.declaration.text)
+        content = {
+            "study": self.declaration.name,
+            "title": self.declaration.title,
+            "version": version("bayespbrl"),
+            "source": source_digest(),
+            "command": command,
+            "machine": machine(),
+            "date": datetime.now(UTC).date().isoformat(),
+            "trials": self.trials,
+            "seed": self.declaration.seed,
+        }
+        write_file(self.directory / "study.json", json.dumps(content, indent=1) + "\n")
+
+    def write_table(self) -> None:
+        """Write `iterations.csv` of the finished trials."""
+        tables = [
+            _table_of(declared.levels, seeds)
+            for declared, seeds in zip(self.declaration.rows, self.rows, strict=True)
+            if seeds.with_outcome(True)
+        ]
+        if tables:
+            with written_aside(self.directory / "iterations.csv") as aside:
+                pd.concat(tables).to_csv(aside, index=False, lineterminator="\n", float_format="%.6g")
+
+
+def _table_of(levels: tuple[str, ...], seeds: Seeds) -> pd.DataFrame:
+    """A line for each trial of a row and each iteration that it had."""
+    table = collected(seeds)
+    if SECONDS[0] in table:
+        table["seconds"] = sum(table[name] for name in SECONDS)
+    present = {column: name for column, name in FIGURES.items() if name in table}
+    lines = table[list(present.values())].to_dataframe(["seed", "iteration"]).reset_index()
+    lines = lines.rename(columns={name: column for column, name in present.items()})
+    if "seconds" in lines:  # an iteration that a trial did not have took none
+        lines = lines[lines["seconds"].notna()]
+    lines = lines.astype({"answers": int} | ({"converged": bool} if "converged" in lines else {}))
+    for place, (axis, level) in enumerate(zip(AXES, levels, strict=True)):
+        lines.insert(place, axis, level)
+    return lines.reindex(columns=[*AXES, "seed", "iteration", *FIGURES])
+
+
+def _check_same(declaration: Declaration, directory: Path) -> None:
+    """That a directory is new, or holds this study by this version."""
+    if not directory.exists():
+        return
+    if not directory.is_dir():
+        raise ValueError(f"{directory}: expected a directory for the study, got a file")
+    if not any(directory.iterdir()):
+        return
+    kept = read_study_json(directory)
+    if kept.get("version") != version("bayespbrl"):
+        raise ValueError(
+            f"{directory}: expected a study by version {version('bayespbrl')}, got one by {kept.get('version')}; "
+            "choose another --out"
+        )
+    before = _settled(parsed((directory / "study.toml").read_text(), declaration.name))
+    if kept.get("study") != declaration.name or before != _settled(declaration):
+        raise ValueError(
+            f"{directory}: expected the study {declaration.name} as it is declared now, got another: "
+            f"{kept.get('study')}; choose another --out"
+        )
+
+
+def _settled(declaration: Declaration) -> tuple[Any, ...]:
+    """What may not change between two calls of a study."""
+    rows = [(row.levels, row.env, dict(row.options), row.untrained) for row in declaration.rows]
+    return declaration.seed, rows
+
+
+def read_study_json(directory: Path) -> dict[str, Any]:
+    """`study.json` of a study's directory; `ValueError` where there is none, or it is damaged."""
+    file = directory / "study.json"
+    try:
+        content = json.loads(file.read_text())
+        if not (directory / "study.toml").exists():
+            raise OSError("it has no study.toml")
+        tomllib.loads((directory / "study.toml").read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{directory}: expected the directory of a study, got {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{file}: expected the description of a study, got a foreign file")
+    return content
+
+
+def machine() -> str:
+    """The machine in words: processor, cores, Python and JAX."""
+    processor = platform.processor() or platform.machine()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{processor}, {cores} cores, Python {platform.python_version()}, jax {version('jax')}"
+
+
+def source_digest() -> str:
+    """The first ten digits of the SHA-256 digest of the package's Python files: which source a study ran with."""
+    digest = sha256()
+    root = Path(__file__).parents[1]
+    for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:10]

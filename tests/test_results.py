@@ -1,0 +1,211 @@
+"""Results of studies: intervals against known values, tables against hand-made data, what is refused."""
+
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+from test_cli import call, refused
+from test_trials import without_processes
+
+from bayespbrl.diagnostics.report.contents import read_contents
+from bayespbrl.results import read_study, values_table, write_results
+from bayespbrl.results.intervals import (
+    answers_for_good,
+    benjamini_hochberg,
+    failed_trials,
+    holm,
+    median_interval,
+    paired_difference,
+    performance_profile,
+)
+from bayespbrl.studies import Study
+from bayespbrl.studies.declaration import parsed
+
+DECLARATION = """
+title = "Hand-made"
+trials = 4
+seed = 1
+report_at = [3]
+[tasks.gridworld]
+[methods.first]
+[methods.second]
+utility = "linear-program"
+[methods.known]
+utility = "known-reward"
+[methods.random]
+untrained = true
+"""
+# value by seed and iteration, one answer more each; random policy 0, known reward 100: 0.95 is 95, failed below 50
+VALUES = {
+    "first": [[10, 96, 90, 97], [20, 97, 96, 98], [30, 98, 97, 99], [40, 94, 96, 20]],
+    "second": [[10, 20, 30, 40], [20, 30, 40, 60], [30, 40, 50, 70], [40, 50, 60, 80]],
+    "known": [[90, 95, 100, 100]] * 4,
+}
+
+
+@pytest.fixture
+def made(tmp_path):
+    """A directory with the data of a study, made by hand."""
+    directory = tmp_path / "made"
+    directory.mkdir()
+    kept = {
+        "study": "made",
+        "version": "0.0",
+        "source": "abc",
+        "command": "bayespbrl study made",
+        "machine": "a machine",
+    }
+    (directory / "study.json").write_text(json.dumps(kept | {"date": "2026-01-01"}))
+    (directory / "study.toml").write_text(DECLARATION)
+    figures = {"terminated": 0, "converged": True, "rhat": 1.002, "effective_sample_size": 500, "signal": 0.7}
+    figures |= {"kl": 0.2, "kl_bound": 0.4, "seconds": 30}
+    names = {"tasks": "gridworld", "noise": None, "variants": None}
+    lines = [
+        names
+        | {"methods": method, "seed": seed + 1, "iteration": i + 1, "answers": i + 2, "value": value}
+        | {"value_newest": value, **figures}
+        for method, trials in VALUES.items()
+        for seed, trial in enumerate(trials)
+        for i, value in enumerate(trial)
+    ]
+    lines += [
+        names | {"methods": "random", "seed": seed, "iteration": 0, "answers": 0, "value": 0, "value_newest": 0}
+        for seed in (1, 2, 3, 4)
+    ]
+    order = ["tasks", "methods", "noise", "variants", "seed", "iteration", "answers", "value", "value_newest"]
+    pd.DataFrame(lines)[[*order, *figures]].to_csv(directory / "iterations.csv", index=False)
+    return directory
+
+
+def test_the_values_table_is_that_of_hand_made_trials(made):
+    table = values_table(read_study(made)).set_index("methods")
+    first, second = table.loc["first"], table.loc["second"]
+    assert first["median"] == "97.5"
+    assert first["after 3"] == "96.5 [95.5]"
+    assert second["relative value"] == "0.650"
+    # the median is at 96.5 after three answers, and not below 95 again
+    assert first["answers to 0.95 for good"].startswith("3 [")
+    assert second["answers to 0.95 for good"].startswith("never")
+    assert first["failed"] == "1 of 4"
+    bounds = stats.binomtest(1, 4).proportion_ci(method="exact")
+    assert first["exact interval"] == f"[{bounds.low:.2f}, {bounds.high:.2f}]"
+    assert (first["difference"], first["p (Holm)"]) == ("–", "–")
+    assert second["difference"].startswith("-33.5 [")  # of −57, −38, −29, +60
+    assert second["at answers"] == "5"
+    assert table.loc["random", "failed"] == "–"
+    assert "noise" not in table.columns
+
+
+def test_the_page_names_study_command_version_date_and_machine_and_counts_comparisons(made, tmp_path):
+    page, *files = write_results(made, tmp_path / "out")
+    text = page.read_text()
+    for part in ("Study `made`", "bayespbrl study made", "version 0.0", "2026-01-01", "a machine", "of 2 comparisons"):
+        assert part in text
+    assert "| gridworld | first | the default | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
+    assert {file.name for file in files} == {"values.csv", "runs.csv", "curves.png", "profiles.png"}
+    assert sorted(path.name for path in made.iterdir()) == ["iterations.csv", "study.json", "study.toml"]
+
+
+def test_for_good_is_not_first_touch():
+    answers = np.array([2, 3, 4, 5, 6])
+    values = np.array([[0, 1, 0, 1, 1], [0, 1, 0, 1, 1], [0, 1, 0, 1, 1]])
+    assert answers_for_good(answers, values, 1.0) == (5, 5, 5)
+    assert answers_for_good(answers, values[:, :3], 1.0) == (np.inf, np.inf, np.inf)
+    assert answers_for_good(answers, np.ones((3, 5)), 1.0).estimate == 2
+
+
+def test_p_values_are_adjusted_as_by_hand():
+    p = [0.01, 0.04, 0.03, 0.005]
+    np.testing.assert_allclose(holm(p), [0.03, 0.06, 0.06, 0.02])
+    np.testing.assert_allclose(benjamini_hochberg(p), [0.02, 0.04, 0.04, 0.02])
+    assert holm([]).shape == benjamini_hochberg([]).shape == (0,)
+    np.testing.assert_array_equal(holm([0.7, 0.9]), [1.0, 1.0])
+
+
+def test_exact_intervals_are_those_of_clopper_and_pearson():
+    interval = failed_trials(0, 20)
+    assert (interval.estimate, interval.low) == (0, 0)
+    assert interval.high == pytest.approx(1 - 0.025 ** (1 / 20))
+
+
+def test_the_bootstrap_interval_of_a_median_covers_it_as_often_as_it_says():
+    rng, covered = np.random.default_rng(7), 0
+    for _ in range(60):
+        interval = median_interval(rng.normal(size=40))
+        covered += interval.low <= 0 <= interval.high
+    assert 51 <= covered <= 60  # 57 are expected
+    assert median_interval(np.ones(5)) == (1, 1, 1)
+    assert np.isnan(median_interval(np.ones(1)).low)
+
+
+def test_equal_trials_do_not_differ_and_shifted_ones_do():
+    values = np.arange(12.0)
+    assert paired_difference(values, values) == ((0, 0, 0), 1.0)
+    interval, p = paired_difference(values + 3, values)
+    assert interval == (3, 3, 3)
+    assert p < 0.001
+
+
+def test_a_performance_profile_averages_tasks_and_not_trials():
+    relative = {"easy": np.ones(30), "hard": np.array([0.0, 0.0, 1.0, 1.0])}
+    profile = performance_profile(relative, np.array([-0.1, 0.5, 1.0]))
+    np.testing.assert_allclose(profile.share, [1.0, 0.75, 0.0])
+    assert profile.low[1] < 0.75 < profile.high[1]
+
+
+DAMAGE = {
+    "study.json": ["", "[]", "[" * 100_000],
+    "study.toml": ["tasks = ", "[tasks.gridworld"],
+    "iterations.csv": ["", "seed,value\n1,2", "\0\0\0"],
+    "answers.csv": ["", "seed\n1"],
+}
+
+
+@pytest.mark.parametrize(("file", "content"), [(file, text) for file, texts in DAMAGE.items() for text in texts])
+def test_damaged_data_is_one_line(monkeypatch, capsys, made, file, content):
+    (made / file).write_text(content)
+    assert str(made) in refused(monkeypatch, capsys, "results", made)
+    (made / file).unlink()
+    if file != "answers.csv":
+        assert str(made) in refused(monkeypatch, capsys, "results", made)
+
+
+def test_text_in_place_of_numbers_and_no_finished_trial_are_named(made):
+    lines = (made / "iterations.csv").read_text()
+    (made / "iterations.csv").write_text(lines.replace("97.0", "much").replace("97", "much"))
+    with pytest.raises(ValueError, match="expected numbers as"):
+        read_study(made)
+    (made / "iterations.csv").write_text(lines.splitlines()[0] + "\n")
+    with pytest.raises(ValueError, match="expected finished trials"):
+        read_study(made)
+
+
+RUN = """
+trials = 1
+seed = 2970
+[options]
+preset = "paper"
+iterations = 4
+max_steps = 20
+evaluation_episodes = 3
+[tasks.gridworld]
+"""
+
+
+@pytest.mark.slow
+def test_predictions_are_those_that_the_report_shows_and_old_runs_are_read_anew(monkeypatch, tmp_path):
+    without_processes(monkeypatch)
+    study = Study.prepare(parsed(RUN, "run"), tmp_path / "run")
+    assert study.run() == []
+    (tmp_path / "run" / "iterations.csv").unlink()  # as if it had been stopped
+    assert call(monkeypatch, "results", tmp_path / "run") == 0
+    kept = pd.read_csv(tmp_path / "run" / "answers.csv")
+    shown = [a for a in read_contents(tmp_path / "run" / "gridworld" / "seed-2970").answers if a.iteration > 1]
+    np.testing.assert_allclose(kept["predicted"], [a.predicted for a in shown if a.row is not None], rtol=1e-5)
+    assert "Calibration" in (tmp_path / "run" / "results.md").read_text()
+    data = shutil.copytree(tmp_path / "run", tmp_path / "data", ignore=shutil.ignore_patterns("gridworld", "results*"))
+    assert call(monkeypatch, "results", data) == 0  # the four files are enough
+    assert (data / "results.md").read_text() == (tmp_path / "run" / "results.md").read_text()

@@ -1,0 +1,290 @@
+"""Declared studies: what is declared, run, resumed, refused; trials that die; a cluster of real workers."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import BrokenExecutor
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from test_cli import call, refused
+from test_trials import ThisProcess, without_processes
+
+from bayespbrl import runs
+from bayespbrl.studies import Study, declared, rows
+from bayespbrl.studies.cluster import scheduler_executor
+from bayespbrl.studies.declaration import parsed, shipped
+from bayespbrl.studies.engine import Engine, Progress
+from bayespbrl.studies.processes import trial_processes
+from bayespbrl.studies.rows import Seeds, row_of, run_trial
+
+TINY = {"preset": "paper", "utility": "linear-program", "iterations": 2, "max_steps": 10, "evaluation_episodes": 2}
+DECLARATION = """
+title = "Two tiny rows"
+trials = 2
+seed = 2980
+[options]
+preset = "paper"
+iterations = 2
+max_steps = 10
+evaluation_episodes = 2
+[tasks.gridworld]
+minutes = 2
+[methods.linear-program]
+utility = "linear-program"
+[methods.random]
+untrained = true
+[noise.none]
+[noise.mistaken]
+expert = "mistaken"
+[[leave_out]]
+methods = ["random"]
+noise = ["mistaken"]
+"""
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The directory of the tiny study, not to be changed."""
+    directory = tmp_path_factory.mktemp("studies") / "tiny"
+    study = Study.prepare(parsed(DECLARATION, "tiny"), directory)
+    assert study.minutes_left() == pytest.approx(2 * 2 * 2.0)  # two rows that learn
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        without_processes(monkeypatch)
+        assert study.run(command="bayespbrl study tiny") == []
+    return directory
+
+
+def test_every_cell_is_a_run_directory_and_the_table_has_a_line_for_each_iteration(finished):
+    assert sorted(path.relative_to(finished).as_posix() for path in finished.glob("*/*/*/seed-*")) == [
+        f"gridworld/{row}/seed-{seed}"
+        for row in ("linear-program/mistaken", "linear-program/none", "random/none")
+        for seed in (2980, 2981)
+    ]
+    table = pd.read_csv(finished / "iterations.csv")
+    assert len(table) == 2 * 2 * 2 + 2
+    last = table[(table.methods == "linear-program") & (table.noise == "none") & (table.seed == 2981)].iloc[-1]
+    kept = runs.load(finished / "gridworld/linear-program/none/seed-2981").iterations[-1]
+    assert (last.answers, last.value) == (kept["answers"], pytest.approx(kept["value"], rel=1e-5))
+    random = table[table.methods == "random"]
+    assert random.iteration.tolist() == [0, 0]
+    assert random.value.notna().all()
+    description = json.loads((finished / "study.json").read_text())
+    assert {"version", "command", "machine", "date"} <= set(description)
+
+
+def test_an_untrained_cell_has_the_value_of_the_first_policy(finished):
+    learner = runs.resume(finished / "gridworld/random/none/seed-2980")
+    kept = json.loads((finished / "gridworld/random/none/seed-2980/first-policy.json").read_text())
+    assert kept["value"] == pytest.approx(float(learner.cycle.evaluated(learner.policy).total.mean()))
+
+
+def test_a_second_call_computes_nothing_again_and_more_trials_may_follow(finished, tmp_path, monkeypatch):
+    without_processes(monkeypatch)
+    copy = shutil.copytree(finished, tmp_path / "study")
+    shutil.rmtree(copy / "gridworld/linear-program/none/seed-2981")
+    before = {file: file.stat().st_mtime_ns for file in copy.glob("*/*/*/seed-*/**/*") if file.is_file()}
+    seen = []
+    again = Study.prepare(parsed(DECLARATION, "tiny"), copy)
+    assert (again.finished, again.cells) == (5, 6)
+    again.run(progress=lambda now: seen.append((now.done, now.failed)))
+    assert seen[-1] == (6, 0)
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+    assert (copy / "iterations.csv").read_text().split("\n")[1].split(",")[:7] == (
+        (finished / "iterations.csv").read_text().split("\n")[1].split(",")[:7]
+    )
+    assert Study.prepare(parsed(DECLARATION, "tiny"), copy, trials=3).finished == 6
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_every_shipped_study_is_one(name):
+    declaration = declared(name)
+    assert declaration.rows
+    assert declaration.seed >= 2000  # lower ones are used up
+
+
+BAD = [
+    ("title = [", "expected TOML"),
+    ("[tasks]", "at least one task"),
+    ("trials = 0\n[tasks.gridworld]", "trials: expected a whole number >= 1"),
+    ("[tasks.gridworld]\nspeed = 3", "tasks.gridworld: expected entries among .*, got speed"),
+    ("[tasks.gridworld]\nminutes = 'long'", "minutes: expected a number"),
+    ("[options]\nseed = 4\n[tasks.gridworld]", "options: expected entries among .*, got seed"),
+    ("levels = 3\n[tasks.gridworld]", "expected entries among .*, got levels"),
+    ("[tasks.gridworld]\n[noise]\nfew = 3", "noise.few: expected a table, got 3"),
+    ("[tasks.gridworld]\n[[leave_out]]\ntasks = ['nowhere']", "leave_out: expected a list of tasks among gridworld"),
+    ("[tasks.gridworld]\n[[leave_out]]\ntasks = ['gridworld']", "all are left out"),
+    ("[tasks.'../up']", "expected a name of letters"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD, ids=[message[:30] for _, message in BAD])
+def test_a_bad_declaration_is_named(text, message):
+    with pytest.raises(ValueError, match=f"study bad.*{message}"):
+        parsed(text, "bad")
+
+
+def test_an_unknown_study_task_or_value_is_one_line(monkeypatch, capsys, tmp_path):
+    assert "study: expected one of" in refused(monkeypatch, capsys, "study", "nothing", "--out", tmp_path / "out")
+    missing = tmp_path / "missing.toml"
+    assert "cannot be read" in refused(monkeypatch, capsys, "study", missing, "--out", tmp_path / "out")
+    for text, message in [("[tasks.mars]", "mars: environment"), ("[tasks.gridworld]\nexpert = 'me'", "expert")]:
+        missing.write_text(text)
+        assert message in refused(monkeypatch, capsys, "study", missing, "--out", tmp_path / "out")
+    missing.write_text("[tasks.gridworld]")
+    assert "trials: expected" in refused(
+        monkeypatch, capsys, "study", missing, "--trials", 0, "--out", tmp_path / "out"
+    )
+    assert "jobs: expected" in refused(monkeypatch, capsys, "study", missing, "--jobs", 0, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_directory_of_something_else_other_settings_or_another_version_is_refused(finished, tmp_path):
+    study = parsed(DECLARATION, "tiny")
+    copy = shutil.copytree(finished, tmp_path / "study")
+    others = [DECLARATION.replace("iterations = 2", "iterations = 3"), DECLARATION.replace("2980", "2990")]
+    for text in others:
+        with pytest.raises(ValueError, match="as it is declared now, got another"):
+            Study.prepare(parsed(text, "tiny"), copy)
+    description = json.loads((copy / "study.json").read_text())
+    (copy / "study.json").write_text(json.dumps(description | {"version": "0.0.1"}))
+    with pytest.raises(ValueError, match=r"got one by 0\.0\.1"):
+        Study.prepare(study, copy)
+    (copy / "study.json").unlink()
+    with pytest.raises(ValueError, match="expected the directory of a study"):
+        Study.prepare(study, copy)
+    with pytest.raises(ValueError, match="got a file"):
+        Study.prepare(study, copy / "study.toml")
+
+
+def test_a_dry_run_says_how_many_cells_and_how_long_and_writes_nothing(monkeypatch, capsys, tmp_path):
+    (tmp_path / "tiny.toml").write_text(DECLARATION)
+    options = ("--trials", 30, "--jobs", 2, "--dry-run", "--out", tmp_path / "out")
+    assert call(monkeypatch, "study", tmp_path / "tiny.toml", *options) == 0
+    assert "3 rows of 30 trials, 90 cells, 0 of them finished; about 60 min on 2 cores." in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+
+
+class Dies:
+    """An executor whose workers die with their first calls of some seeds."""
+
+    def __init__(self, deaths):
+        self.deaths, self.calls = deaths, []
+
+    def submit(self, function, row, seed):
+        self.calls.append(seed)
+        future = ThisProcess().submit(lambda: True)
+        if self.calls.count(seed) <= self.deaths.get(seed, 0):
+            future = ThisProcess().submit(self.die)
+        return future
+
+    @staticmethod
+    def die():
+        raise BrokenExecutor("its process ended (signal 9)")
+
+
+def test_a_trial_that_dies_is_started_three_times_at_most_and_the_others_go_on(tmp_path):
+    seeds = Seeds(row_of("gridworld", tmp_path / "row", TINY, seed=5, name="row"), 4)
+    executor, seen = Dies({6: 2, 7: 3}), []
+    failures = Engine([seeds], executor, lambda now: seen.append((now.done, now.failed))).run()
+    assert sorted(executor.calls) == [5, 6, 6, 6, 7, 7, 7, 8]
+    assert seeds.with_outcome(True) == [5, 6, 8]
+    assert [str(failure) for failure in failures] == ["row seed 7: died 3 times: its process ended (signal 9)"]
+    assert seen[-1] == (3, 1)
+
+
+def test_the_time_left_follows_the_pace_of_this_call():
+    assert Progress(10, before=4, done=4, seconds=5.0).seconds_left is None
+    assert Progress(10, before=4, done=6, failed=1, seconds=30.0).seconds_left == pytest.approx(15 * 3)
+
+
+def killed_once(directory):
+    """The number of the process, at the first call; that process is then killed."""
+    mark = Path(directory) / "killed"
+    if not mark.exists():
+        mark.write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()
+
+
+def fails(message):
+    raise ZeroDivisionError(message)
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_fails_its_own_call_and_no_other(tmp_path):
+    with trial_processes(2) as executor:
+        calls = [executor.submit(killed_once, tmp_path)] + [executor.submit(time.sleep, 0.2) for _ in range(3)]
+        with pytest.raises(BrokenExecutor, match="signal 9"):
+            calls[0].result()
+        assert [call.result() for call in calls[1:]] == [None] * 3
+        assert executor.submit(killed_once, tmp_path).result() != os.getpid()
+        with pytest.raises(RuntimeError, match="ZeroDivisionError: by nothing"):
+            executor.submit(fails, "by nothing").result()
+
+
+def test_no_scheduler_is_one_line(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("bayespbrl.studies.cluster.WAIT", 1)
+    (tmp_path / "tiny.toml").write_text(DECLARATION)
+    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
+        options = ("--scheduler", address, "--out", tmp_path / "out")
+        assert "scheduler: expected one at" in refused(monkeypatch, capsys, "study", tmp_path / "tiny.toml", *options)
+    assert not (tmp_path / "out").exists()
+
+
+@contextlib.contextmanager
+def cluster(folder):
+    """A Dask scheduler and two workers, each a process; yields the address and the workers."""
+    file = folder / "scheduler.json"
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder, "env": environment}
+    program = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    started = [subprocess.Popen([*program, "--port", "0", "--no-dashboard", "--scheduler-file", str(file)], **quiet)]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--no-nanny", "--nthreads", "1", "--no-dashboard"]
+    try:
+        started += [subprocess.Popen([*worker, "--scheduler-file", str(file)], **quiet) for _ in range(2)]
+        waited = time.monotonic() + 60
+        while not file.exists():
+            assert time.monotonic() < waited
+            time.sleep(0.1)
+        yield json.loads(file.read_text())["address"], started[1:]
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_loses_no_trial_and_computes_nothing_twice(tmp_path):
+    longer = TINY | {"iterations": 8}
+    seeds = Seeds(row_of("gridworld", tmp_path / "row", longer, seed=5), 4)
+    with cluster(tmp_path) as (address, workers), scheduler_executor(address) as executor:
+
+        def kill_one(now):  # in the middle of a trial: two iterations are on the disk, more are to come
+            logs = [tmp_path / "row" / f"seed-{seed}" / "iterations" / "0002.nc" for seed in (5, 6, 7, 8)]
+            if any(log.exists() for log in logs) and all(worker.poll() is None for worker in workers):
+                workers[0].kill()
+
+        engine = Engine([seeds], executor, kill_one)
+        assert engine.run() == []
+        assert workers[0].poll() is not None
+    assert seeds.with_outcome(True) == [5, 6, 7, 8]
+    for seed in (5, 6, 7, 8):
+        log = (tmp_path / "row" / f"seed-{seed}" / "events.jsonl").read_text().splitlines()
+        improved = [json.loads(line)["iteration"] for line in log if json.loads(line)["event"] == "improved"]
+        assert improved == list(range(1, 9))
+        alone = row_of("gridworld", tmp_path / "alone", longer, seed=5)
+    assert run_trial(alone, 6)
+    kept, again = (runs.load(tmp_path / name / "seed-6").iterations for name in ("row", "alone"))
+    assert [entry["value"] for entry in kept] == [entry["value"] for entry in again]
+
+
+def test_a_row_needs_a_simulated_expert(tmp_path):
+    with pytest.raises(ValueError, match="expert: expected one of return, stochastic"):
+        rows.row_of("gridworld", tmp_path, {"expert": "terminal"}, seed=1)
