@@ -24,13 +24,13 @@ from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.preferences import opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
 from bayespbrl.settings import Settings
-from bayespbrl.trajectories import Trajectory, transitions
+from bayespbrl.trajectories import Trajectory, clips_of, transitions
 from bayespbrl.utility.comparisons import Comparisons
 from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.inference import estimate
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT = range(10)
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT, CLIPS = range(11)
 # Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
 
@@ -51,6 +51,11 @@ class Cycle:
     feature_source: FeatureSource
     schedule: schedules.Schedule
     query_rule: queries.QueryRule
+
+    def __post_init__(self) -> None:
+        steps, options = self.settings.questions.clip_steps, self.settings.rollouts
+        if steps is not None and steps > (limit := rollouts.step_limit(self.environment, options.max_steps)):
+            raise ValueError(f"clip_steps: expected at most {limit}, the steps of an episode, got {steps}")
 
     def next(self, state: LearnerState) -> Entry | None:
         """What happens next without an answer; None where a question waits for one, or the run is finished."""
@@ -73,11 +78,14 @@ class Cycle:
             hold=options.exploration_hold,
             starts=self._starts(state.iteration) if questions.same_start else None,
         )
-        chosen = self._chosen_questions(state, (*state.trajectories, *collected))
+        clips = questions.clips(collected, rng=self._rng(CLIPS, state.iteration))
+        known = (*state.compared, *clips_of(collected, clips))
+        chosen = self._chosen_questions(state, known)
         event = {
             "event": "collected",
             "iteration": state.iteration + 1,
             **{name: value for name, value in vars(chosen).items() if value is not None},
+            **({} if clips is None else {"clips": clips}),
             "seconds": time.perf_counter() - began,
         }
         return _entry(event, trajectories=collected)
@@ -122,7 +130,7 @@ class Cycle:
             shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
             return _entry({"event": "asked", "query": number, **shown, "repeats": again.number})
         incumbent = state.opponents[newcomer] if state.opponents else state.preferences.undominated[-1]
-        query = queries.show(number, newcomer, incumbent, state.trajectories, rng=self._rng(SHOW, number))
+        query = queries.show(number, newcomer, incumbent, state.compared, rng=self._rng(SHOW, number))
         event = {"event": "asked", "query": number, "first": query.first, "second": query.second, "newcomer": newcomer}
         if options.same_start:
             event["rivals"] = rivals(query, state.trajectories, state.preferences)
@@ -199,7 +207,7 @@ class Cycle:
         sides = None if settings.expert in SIMULATED else [row.side for row in rows]
         return estimate(
             Comparisons.among(
-                state.trajectories,
+                state.compared,
                 known.pairs,
                 ties=known.ties,
                 sides=sides,

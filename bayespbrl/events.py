@@ -22,7 +22,7 @@ from bayespbrl import checks
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.preferences import Answer, PastQuestion, Preferences, Query, parse_answer
 from bayespbrl.settings import Settings
-from bayespbrl.trajectories import Trajectory
+from bayespbrl.trajectories import Trajectory, clips_of
 from bayespbrl.utility.estimate import UtilityEstimate
 
 
@@ -59,6 +59,7 @@ class LearnerState:
       bound: the last decision on the KL bound; None before the first.
       iteration: iterations completed.
       trajectories: all of them, by number.
+      clips: first step and number of steps of the part of each that questions are about; () where they are about all.
       preferences: the answers so far.
       collected: whether the next iteration's trajectories are among them.
       candidates: trajectories to ask about in this iteration, best first.
@@ -83,6 +84,7 @@ class LearnerState:
     bound: Bound | None = None
     iteration: int = 0
     trajectories: tuple[Trajectory, ...] = ()
+    clips: tuple[tuple[int, int], ...] = ()
     preferences: Preferences = field(default_factory=Preferences)
     collected: bool = False
     candidates: tuple[int, ...] = ()
@@ -101,6 +103,11 @@ class LearnerState:
     def finished(self, settings: Settings) -> bool:
         """Whether a run with these settings ends here: after an iteration, not within one."""
         return not self.collected and settings.finished(self.iteration, self.preferences.answers, self.unasked)
+
+    @property
+    def compared(self) -> tuple[Trajectory, ...]:
+        """What questions are about, by the numbers of the trajectories: the trajectories, or a part of each."""
+        return clips_of(self.trajectories, self.clips or None)
 
     @property
     def kept_policy(self) -> Any:
@@ -194,6 +201,7 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     return replace(
         state,
         trajectories=state.trajectories + tuple(parts["trajectories"]),
+        clips=state.clips + clips_in(event),
         preferences=preferences,
         collected=True,
         candidates=candidates,
@@ -204,13 +212,22 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     )
 
 
+def clips_in(event: Mapping[str, Any]) -> tuple[tuple[int, int], ...]:
+    """First step and number of steps of the part of each trajectory that came with `collected`; () for all of them."""
+    return tuple(
+        (checks.whole("clips: first step", first, 0), checks.whole("clips: steps", steps))
+        for first, steps in event.get("clips", ())
+    )
+
+
 def _asked(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     shown, repeats = (event["first"], event["second"]), event.get("repeats")
     if any(not 0 <= number < len(state.trajectories) for number in shown):
         raise ValueError(f"asked: expected trajectories below {len(state.trajectories)}, got {shown}")
     if repeats is not None and (repeats, *shown[::-1]) not in [past[:3] for past in state.past]:
         raise ValueError(f"asked: expected a question that was asked before with sides swapped, got {dict(event)}")
-    both = (state.trajectories[shown[0]], state.trajectories[shown[1]])
+    compared = state.compared
+    both = (compared[shown[0]], compared[shown[1]])
     query = Query(event["query"], *shown, event["newcomer"], both, repeats)
     rivals = event.get("rivals")
     return replace(

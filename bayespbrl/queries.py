@@ -44,6 +44,8 @@ class Questions:
       same_start: whether a newcomer is compared with a trajectory from the same start, where there is one: the better
         of two unlike starts says little about a policy. The paper compares it with the best of all.
       worthwhile: whether a question is left out whose answer is expected to tell less than `LEAST_INFORMATION`.
+      clip_steps: length of the part of each trajectory, drawn at random, that questions are about; None: all of it. A
+        person sees a part in seconds.
       repeats: share of the questions that are an earlier one with sides swapped. They are for people: the answers tell
         how consistent each is. They count for the budget of answers, and not as those of an iteration.
     """
@@ -55,6 +57,7 @@ class Questions:
     answers: int | None = None
     same_start: bool = False
     worthwhile: bool = False
+    clip_steps: int | None = None
     repeats: float = 0.0
 
     def __post_init__(self) -> None:
@@ -65,9 +68,21 @@ class Questions:
         checks.share("repeats", self.repeats, below_one=True)
         if self.answers is not None:
             checks.whole("answers", self.answers)
+        if self.clip_steps is not None:
+            checks.whole("clip_steps", self.clip_steps)
         for name in ("same_start", "worthwhile"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
+        if self.same_start and self.clip_steps is not None:
+            raise ValueError("same_start: expected false with clip_steps, parts that begin anywhere, got true")
+
+    def clips(self, trajectories: Sequence[Trajectory], *, rng: np.random.Generator) -> list[list[int]] | None:
+        """First step and number of steps of the part of each trajectory that is compared; None: all of it."""
+        if self.clip_steps is None:
+            return None
+        lengths = [min(self.clip_steps, len(trajectory)) for trajectory in trajectories]
+        firsts = [rng.integers(len(each) - steps + 1) for each, steps in zip(trajectories, lengths, strict=True)]
+        return [[int(first), steps] for first, steps in zip(firsts, lengths, strict=True)]
 
     def skips(self, preferences: Preferences, unasked: int, estimate: UtilityEstimate, signal: float | None) -> bool:
         """Whether the next iteration asks nothing, after `unasked` in a row that asked nothing.

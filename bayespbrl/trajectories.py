@@ -47,10 +47,23 @@ class Trajectory:
         """Number of steps T."""
         return len(self.actions)
 
+    def clip(self, first: int, steps: int) -> "Trajectory":
+        """The part of at most `steps` steps that begins with step `first`, from 0."""
+        last = min(first + steps, len(self))
+        ends = self.terminated and last == len(self)
+        return Trajectory(self.states[first : last + 1], self.actions[first:last], self.rewards[first:last], ends)
+
     @property
     def total_reward(self) -> float:
         """Undiscounted sum of the hidden reward."""
         return float(np.sum(self.rewards))
+
+
+def clips_of(trajectories: Sequence[Trajectory], clips: Sequence[Sequence[int]] | None) -> tuple[Trajectory, ...]:
+    """The part of each trajectory with this first step and number of steps; None: the trajectories."""
+    if clips is None:
+        return tuple(trajectories)
+    return tuple(one.clip(first, steps) for one, (first, steps) in zip(trajectories, clips, strict=True))
 
 
 @dataclass(frozen=True)

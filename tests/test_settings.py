@@ -50,6 +50,7 @@ BAD = {
     "preset": ["fast", "", None],
     "answers": [0, -1, 2.5, True],
     "same_start": [None, 1, "yes"],
+    "clip_steps": [0, 1.5, "all"],
     "worthwhile": [None, 1, "yes"],
     "repeats": [None, 1, -0.1, "all"],
     "checked": [None, 1, "yes"],

@@ -57,6 +57,7 @@ RUN_OPTIONS = {
     "iterations": "Maximum number of cycles of the four steps; by default they follow from the answers.",
     "kl_bound": "KL bound of each policy update, in nats.",
     "updates_per_iteration": "Maximum number of policy updates per iteration; the paper's is 1.",
+    "clip_steps": "Steps of the part of each trajectory, drawn at random, that questions are about; all if omitted.",
     "same_start": "Whether a question compares two trajectories from the same start, where resets by seed allow it.",
     "unasked_iterations": "Maximum number of consecutive iterations without a question (at most half the answers so "
     "far); with the schedule confidence only while its confidence is high; the paper's is 0.",

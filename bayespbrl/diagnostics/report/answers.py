@@ -53,10 +53,10 @@ def _comparisons(contents: RunContents, table: xr.Dataset, order: Sequence[int] 
     blocks = []
     for place, k in enumerate(order):
         answer = contents.answers[int(k)]
-        shown = [n for n in (answer.first, answer.second) if n in contents.trajectories]
+        shown = [n for n in (answer.first, answer.second) if n in contents.compared]
         for n in shown:
             if n not in pictures:
-                draw = partial(draw_trajectory, contents.environment, contents.trajectories[n])
+                draw = partial(draw_trajectory, contents.environment, contents.compared[n])
                 pictures[n] = thumbnail(f"trajectory-{n}", draw, f"trajectory {n}", f"Drawing of trajectory {n}.")
         title = f"Question {answer.question}: {_in_words(answer)}"
         both = tuple(pictures[n] for n in shown)

@@ -40,6 +40,7 @@ class RunContents:
       answers: in their order, without those taken back; `past` are the same, as the learner keeps them.
       preferences: those that follow from the answers.
       trajectories: by number, those that can be read.
+      clips: first step and number of steps of the part of each that questions are about; () where they are about all.
       estimate: the newest utility estimate that can be read, of iteration `estimate_iteration`; None and 0 without any.
       features_missing: why the estimate's φ, a function of the user's, cannot be used; empty where it can.
       environment: opened; None where it cannot be.
@@ -54,6 +55,7 @@ class RunContents:
     past: tuple[PastQuestion, ...] = ()
     preferences: Preferences = field(default_factory=Preferences)
     trajectories: Mapping[int, Trajectory] = field(default_factory=dict)
+    clips: tuple[tuple[int, int], ...] = ()
     estimate: UtilityEstimate | None = None
     estimate_iteration: int = 0
     features_missing: str = ""
@@ -67,6 +69,13 @@ class RunContents:
         answers = [summary.get("answers", 0) for summary in self.iterations]  # none in a damaged summary
         unasked = next((n for n, before in enumerate(reversed(answers[:-1])) if before != answers[-1]), 0)
         return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked)
+
+    @property
+    def compared(self) -> Mapping[int, Trajectory]:
+        """What questions are about, by number: the trajectories that can be read, or a part of each."""
+        if not self.clips:
+            return self.trajectories
+        return {n: one.clip(*self.clips[n]) for n, one in self.trajectories.items() if n < len(self.clips)}
 
     @property
     def posterior(self) -> xr.DataTree | None:
@@ -116,6 +125,7 @@ def read_contents(
         answers=log.answers,
         past=log.state.past,
         preferences=log.state.preferences,
+        clips=log.state.clips,
         open_question=None if log.state.query is None else log.state.query.number,
         damage=log.damage,
     )
@@ -171,7 +181,7 @@ def _features_failure(contents: RunContents, features: StateFeatures | None, tra
 
 
 def _predicted(contents: RunContents, answer: AnsweredQuestion) -> AnsweredQuestion:
-    both = [contents.trajectories[n] for n in (answer.first, answer.second) if n in contents.trajectories]
+    both = [contents.compared[n] for n in (answer.first, answer.second) if n in contents.compared]
     if contents.without_posterior or len(both) < 2:
         return answer
     if contents.estimate is None:

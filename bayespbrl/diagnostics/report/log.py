@@ -5,7 +5,7 @@ says why.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -113,11 +113,14 @@ def _applied(
     state, answers = LearnerState(None), []
     # stand-ins: applying an event only needs the heavy parts to be there
     parts = {"trajectories": [None] * settings.rollouts.trajectories_per_iteration, "policy": None, "estimate": None}
+    clips: list[tuple[int, int]] = []
     for event in log:
         query, pairs = state.query, len(state.preferences.pairs)
         try:
-            state = events.replay(state, [Entry(event, parts)])
-        except ValueError as error:
+            if event["event"] == "collected":
+                clips += events.clips_in(event)
+            state = events.replay(state, [Entry({**event, "clips": ()}, parts)])
+        except (ValueError, TypeError) as error:
             damage.append(_damage(f"events.jsonl: {error}; what follows is left out"))
             break
         if event["event"] == "answered" and query is not None:
@@ -127,7 +130,7 @@ def _applied(
             who = {name: event[name] for name in ("answerer", "seconds") if name in event}
             shown = (query.first, query.second)
             answers.append(AnsweredQuestion(query.number, state.iteration + 1, *shown, answer, row, **who))
-    return state, answers
+    return replace(state, clips=tuple(clips)), answers
 
 
 def _summaries(path: Path, state: LearnerState, damage: list[ReportWarning]) -> tuple[Summary, ...]:

@@ -155,8 +155,8 @@ def trajectories_table(contents: RunContents) -> xr.Dataset:
     """
     estimate = expect_estimate(contents.estimate)
     asked = {number for answer in contents.answers for number in (answer.first, answer.second)}
-    numbers = sorted(asked & set(contents.trajectories))
-    shown = [contents.trajectories[number] for number in numbers]
+    numbers = sorted(asked & set(contents.compared))
+    shown = [contents.compared[number] for number in numbers]
     data: Variables = {"hidden_return": ("trajectory", np.array([t.total_reward for t in shown]))}
     data["utility"] = ("trajectory", estimate.trajectory_utilities(shown) if shown else np.zeros(0))
     if contents.posterior is not None and shown:
@@ -194,12 +194,12 @@ def ranking_table(contents: RunContents) -> xr.Dataset:
     As of `ranking_probabilities`, with their numbers along `trajectory`; empty without features or posterior.
     """
     size = contents.settings.rollouts.trajectories_per_iteration
-    newest = [n for n in sorted(contents.trajectories) if n >= (contents.estimate_iteration - 1) * size][:size]
-    best = [n for n in contents.preferences.undominated[-1:] if n in contents.trajectories]
+    newest = [n for n in sorted(contents.compared) if n >= (contents.estimate_iteration - 1) * size][:size]
+    best = [n for n in contents.preferences.undominated[-1:] if n in contents.compared]
     numbers = sorted({*newest, *best}) if contents.posterior is not None and not contents.features_missing else []
     if not numbers:
         return xr.Dataset(coords={"trajectory": np.zeros(0, dtype=np.int64)})
-    draws = return_draws(contents.estimate, [contents.trajectories[n] for n in numbers], number=DRAWS)
+    draws = return_draws(contents.estimate, [contents.compared[n] for n in numbers], number=DRAWS)
     return ranking_probabilities(draws.assign_coords(trajectory=numbers))
 
 
@@ -234,7 +234,7 @@ def _preferred_and_dominated(contents: RunContents, answer: AnsweredQuestion) ->
     preferred, dominated = answer.first, answer.second
     if answer.answer is not Answer.FIRST:
         preferred, dominated = dominated, preferred
-    known = contents.trajectories
+    known = contents.compared
     if contents.features_missing or preferred not in known or dominated not in known:
         return None
     return known[preferred], known[dominated]
