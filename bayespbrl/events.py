@@ -25,6 +25,9 @@ from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory, clips_of
 from bayespbrl.utility.estimate import UtilityEstimate
 
+# Each state holds all answers so far: to keep every state would take memory by the square of their number.
+MOST_UNDONE = 50
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -73,7 +76,7 @@ class LearnerState:
       past: the questions so far that were answered.
       shown: the trajectories that were shown in some question.
       summaries: one for each completed iteration.
-      previous: the state before the last answer.
+      before: the states before the last answers, at most `MOST_UNDONE`, the newest last; they have none themselves.
     """
 
     policy: Any
@@ -98,11 +101,16 @@ class LearnerState:
     past: tuple[PastQuestion, ...] = ()
     shown: frozenset[int] = frozenset()
     summaries: tuple[Mapping[str, Any], ...] = ()
-    previous: "LearnerState | None" = field(default=None, repr=False)
+    before: tuple["LearnerState", ...] = field(default=(), repr=False)
 
     def finished(self, settings: Settings) -> bool:
         """Whether a run with these settings ends here: after an iteration, not within one."""
         return not self.collected and settings.finished(self.iteration, self.preferences.answers, self.unasked)
+
+    @property
+    def previous(self) -> "LearnerState | None":
+        """The state before the last answer; None where no answer can be taken back."""
+        return replace(self.before[-1], before=self.before[:-1]) if self.before else None
 
     @property
     def compared(self) -> tuple[Trajectory, ...]:
@@ -151,9 +159,10 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
                 summaries=(*state.summaries, event["summary"]),
             )
         case "undone":
-            if state.previous is None:
-                raise ValueError("undo: expected an answer to take back, got none yet")
-            return state.previous
+            if (before := state.previous) is None:
+                got = f"{MOST_UNDONE} undone" if state.past else "none yet"
+                raise ValueError(f"undo: expected an answer to take back, got {got}")
+            return before
         case other:
             raise ValueError(f"event: expected collected, asked, answered, improved or undone, got {other!r}")
 
@@ -267,7 +276,8 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         left = tuple(number for number in left if number != query.newcomer)
     shown = (query.number, query.first, query.second, query.newcomer, query.repeats)
     past = (*state.past, PastQuestion(*shown, answer, answerer, seconds))
-    after = replace(state, query=None, candidates=left, past=past, previous=state)
+    after = replace(state, query=None, candidates=left, past=past)
+    after = replace(after, before=(*state.before[1 - MOST_UNDONE :], replace(state, before=())))
     if answer is Answer.SKIP:
         return after
     preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]

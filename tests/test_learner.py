@@ -11,7 +11,7 @@ import pytest
 from gymnasium.spaces import Discrete
 from toys import QUICK, Slope, fingerprint
 
-from bayespbrl import Answer, Learner, ReturnExpert, load, queries, resume, rollouts, start
+from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, resume, rollouts, start
 from bayespbrl import cycle as cycle_module
 from bayespbrl.diagnostics.estimates import first_preferred_probability
 from bayespbrl.envs.gridworld import REWARDS
@@ -327,6 +327,20 @@ def test_undo_as_an_answer_takes_the_previous_one_back_and_asks_it_again():
     run.tell(["undo"])
     assert run.ask() == first
     assert run.preferences.answers == 0
+
+
+def test_the_last_answers_can_be_undone_and_no_more_are_held_in_memory(monkeypatch):
+    monkeypatch.setattr(events, "MOST_UNDONE", 2)
+    run = learner(first_queries=5)
+    for _ in range(4):
+        run.tell(["tie"] * len(run.ask()))
+    assert len(run.state.before) == 2
+    run.undo()
+    run.undo()
+    assert run.preferences.answers == 2
+    with pytest.raises(ValueError, match="undo: expected an answer to take back, got 2 undone"):
+        run.undo()
+    assert run.preferences.answers == 2
 
 
 def test_nothing_can_be_undone_before_the_first_answer():
