@@ -29,7 +29,7 @@ from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.inference import estimate
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS = range(9)
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT = range(10)
 # Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
 
@@ -113,12 +113,17 @@ class Cycle:
         return rollouts.reset_seed(self._key(COLLECT, iteration)) + episode
 
     def show(self, state: LearnerState) -> Entry:
-        """Step 4: the next question, the best candidate against its opponent; `asked`."""
-        number, newcomer = state.queries + 1, state.candidates[0]
+        """Step 4: the next question, the best candidate against its opponent, or a repeated one; `asked`."""
+        number, newcomer, options = state.queries + 1, state.candidates[0], self.settings.questions
+        left = options.left(state.preferences.answers + state.wanted)
+        again = queries.repeated(state.past, number, options, left=left, rng=self._rng(REPEAT, number))
+        if again is not None:
+            shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
+            return _entry({"event": "asked", "query": number, **shown, "repeats": again.number})
         incumbent = state.opponents[newcomer] if state.opponents else state.preferences.undominated[-1]
         query = queries.show(number, newcomer, incumbent, state.trajectories, rng=self._rng(SHOW, number))
         event = {"event": "asked", "query": number, "first": query.first, "second": query.second, "newcomer": newcomer}
-        if self.settings.questions.same_start:
+        if options.same_start:
             event["rivals"] = rivals(query, state.trajectories, state.preferences)
         return _entry(event)
 
@@ -126,7 +131,7 @@ class Cycle:
         """Steps 1 and 2, and the value of the new policy, which the learner does not see; `improved`."""
         options = self.settings.rollouts
         clock = [time.perf_counter()]
-        utility = self._estimate(state)
+        utility = self.estimate(state)
         clock.append(time.perf_counter())
         check = self._check(state, utility) if self.settings.update.checked else None
         improved, bound = self.update(state, utility, check)
@@ -184,8 +189,8 @@ class Cycle:
         )
         return checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
 
-    def _estimate(self, state: LearnerState) -> UtilityEstimate:
-        """Step 1."""
+    def estimate(self, state: LearnerState) -> UtilityEstimate:
+        """Step 1, the utility from all answers so far."""
         settings = self.settings
         rng = self._rng(FEATURES, 2 * state.iteration)
         known, rows = state.preferences, state.preferences.rows()
@@ -197,7 +202,7 @@ class Cycle:
                 known.pairs,
                 ties=known.ties,
                 sides=sides,
-                answered_by=[row.answerer for row in rows],
+                answered_by=[row.answerer or "" for row in rows],
                 discount=settings.trajectory_discount,
             ),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),

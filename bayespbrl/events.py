@@ -3,7 +3,8 @@
 Resuming a run, undoing an answer and reporting on a run in progress all use this fold. There are five events:
 
 * `collected`: new trajectories (step 3), and which of them to ask about, in order (step 4);
-* `asked`: a question, with the order in which the two trajectories were shown;
+* `asked`: a question, with the order in which the two trajectories were shown, and the number of the earlier question
+  that it `repeats`, if any;
 * `answered`: the expert's answer; `answerer`, the name of who gave it, and `seconds`, the time they took, where known;
 * `improved`: a new estimate and a new policy (steps 1 and 2), which end an iteration;
 * `undone`: the last answer and everything after it is taken back.
@@ -19,7 +20,7 @@ import numpy as np
 
 from bayespbrl import checks
 from bayespbrl.improvement.schedules import Bound
-from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
+from bayespbrl.preferences import Answer, PastQuestion, Preferences, Query, parse_answer
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
@@ -68,6 +69,7 @@ class LearnerState:
       query: the question that waits for an answer; None if none does.
       rivals: the undominated trajectories that the newcomer of the question competes with; None: all.
       queries: number of questions so far.
+      past: the questions so far that were answered.
       shown: the trajectories that were shown in some question.
       summaries: one for each completed iteration.
       previous: the state before the last answer.
@@ -91,6 +93,7 @@ class LearnerState:
     query: Query | None = None
     rivals: tuple[int, ...] | None = None
     queries: int = 0
+    past: tuple[PastQuestion, ...] = ()
     shown: frozenset[int] = frozenset()
     summaries: tuple[Mapping[str, Any], ...] = ()
     previous: "LearnerState | None" = field(default=None, repr=False)
@@ -116,14 +119,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
         case "collected":
             return _collected(state, event, entry.parts)
         case "asked":
-            shown = (event["first"], event["second"])
-            if any(not 0 <= number < len(state.trajectories) for number in shown):
-                raise ValueError(f"asked: expected trajectories below {len(state.trajectories)}, got {shown}")
-            both = (state.trajectories[shown[0]], state.trajectories[shown[1]])
-            query = Query(event["query"], *shown, event["newcomer"], both)
-            rivals, number = event.get("rivals"), event["query"]
-            rivals = None if rivals is None else tuple(rivals)
-            return replace(state, query=query, queries=number, shown=state.shown.union(shown), rivals=rivals)
+            return _asked(state, event)
         case "answered":
             return _answered(state, event)
         case "improved":
@@ -208,6 +204,24 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     )
 
 
+def _asked(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
+    shown, repeats = (event["first"], event["second"]), event.get("repeats")
+    if any(not 0 <= number < len(state.trajectories) for number in shown):
+        raise ValueError(f"asked: expected trajectories below {len(state.trajectories)}, got {shown}")
+    if repeats is not None and (repeats, *shown[::-1]) not in [past[:3] for past in state.past]:
+        raise ValueError(f"asked: expected a question that was asked before with sides swapped, got {dict(event)}")
+    both = (state.trajectories[shown[0]], state.trajectories[shown[1]])
+    query = Query(event["query"], *shown, event["newcomer"], both, repeats)
+    rivals = event.get("rivals")
+    return replace(
+        state,
+        query=query,
+        queries=query.number,
+        shown=state.shown.union(shown),
+        rivals=None if rivals is None else tuple(rivals),
+    )
+
+
 def answered(query: int, answer: Answer, *, answerer: str | None = None, seconds: float | None = None) -> Entry:
     """The event of an answer to question number `query`; arguments as of `Learner.tell`.
 
@@ -226,14 +240,23 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     query = state.query
     if query is None or query.number != event["query"]:
         raise ValueError(f"answered: expected an answer to {query}, got one to question {event['query']}")
-    left = tuple(number for number in state.candidates if number != query.newcomer)
-    after = replace(state, query=None, candidates=left, previous=state)
-    answer, answerer = parse_answer(event["answer"]), event.get("answerer")
+    answer, answerer, seconds = parse_answer(event["answer"]), event.get("answerer"), event.get("seconds")
     if answerer is not None:
         checks.short_name("answerer", answerer)
+    if seconds is not None:
+        checks.non_negative("seconds", seconds)
+    left, again = state.candidates, query.repeats is not None
+    if not again:
+        left = tuple(number for number in left if number != query.newcomer)
+    shown = (query.number, query.first, query.second, query.newcomer, query.repeats)
+    past = (*state.past, PastQuestion(*shown, answer, answerer, seconds))
+    after = replace(state, query=None, candidates=left, past=past, previous=state)
     if answer is Answer.SKIP:
         return after
     preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]
+    if again:
+        more = state.preferences.add_repeated(query.first, query.second, preferred=preferred, answerer=answerer)
+        return replace(after, preferences=more)
     preferences = state.preferences.add(
         query.newcomer,
         query.incumbent,

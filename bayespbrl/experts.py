@@ -68,7 +68,7 @@ def simulated_expert(wrong_answers: float = 0.0, *, seed: int = 0) -> Expert:
     return NoisyExpert(ReturnExpert(), wrong_answers, seed) if wrong_answers else ReturnExpert()
 
 
-PROMPT = "Which is better? [1] first  [2] second  [t] tie  [s] skip  [u] undo  [q] stop here: "
+PROMPT = "Which is better? [1] first  [2] second  [t] tie  [s] cannot tell  [u] undo  [q] stop here: "
 KEYS = {"1": Answer.FIRST, "2": Answer.SECOND, "t": Answer.TIE, "s": Answer.SKIP, "u": Answer.UNDO}
 
 

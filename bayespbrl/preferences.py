@@ -39,6 +39,8 @@ class Query:
       first, second: numbers of the two trajectories in the order shown, which is drawn at random.
       newcomer: number of the new one; the other is the newest undominated trajectory.
       trajectories: the two trajectories, in the order shown.
+      repeats: number of the earlier question about the same two, which were then shown the other way round; None for a
+        new question.
     """
 
     number: int
@@ -46,10 +48,35 @@ class Query:
     second: int
     newcomer: int
     trajectories: tuple[Trajectory, Trajectory]
+    repeats: int | None = None
 
     @property
     def incumbent(self) -> int:
         return self.second if self.newcomer == self.first else self.first
+
+
+class PastQuestion(NamedTuple):
+    """A question with its answer.
+
+    Attributes:
+      number, first, second, newcomer, repeats: as of `Query`.
+      answer: `FIRST`, `SECOND`, `TIE` or `SKIP`.
+      answerer, seconds: who gave it, and how long they took; None: not known.
+    """
+
+    number: int
+    first: int
+    second: int
+    newcomer: int
+    repeats: int | None
+    answer: Answer
+    answerer: str | None
+    seconds: float | None
+
+    @property
+    def preferred(self) -> int | None:
+        """Number of the preferred trajectory; None where neither is."""
+        return {Answer.FIRST: self.first, Answer.SECOND: self.second}.get(self.answer)
 
 
 class Source(NamedTuple):
@@ -162,6 +189,41 @@ class Preferences:
             new_pairs = tuple((member, newcomer) for member in beside)
         after = Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, self.sources)
         return after._with_sources(self, asked, shown_first, answerer)
+
+    def add_repeated(
+        self, first: int, second: int, *, preferred: int | None, answerer: str | None = None
+    ) -> "Preferences":
+        """The preferences after a repeated question, with the first shown first: one more pair or tie.
+
+        Decision: the undominated trajectories stay. Answers that contradict each other are for the posterior to weigh.
+        """
+        other = second if preferred == first else first
+        pairs, ties = self.pairs, self.ties
+        asked = (first, second) if preferred is None else (preferred, other)
+        if preferred is None:
+            ties = (*ties, asked)
+        else:
+            pairs = (*pairs, asked)
+        after = replace(self, pairs=pairs, ties=ties, answers=self.answers + 1)
+        return after._with_sources(self, asked, first, answerer)
+
+    def without(self, answerer: str) -> "Preferences":
+        """The pairs and ties that do not follow from the answers of one; the undominated trajectories stay.
+
+        Raises:
+          ValueError: a name that nobody who answered has.
+        """
+        if answerer not in self.answerers:
+            names = ", ".join(repr(name) for name in self.answerers)
+            raise ValueError(f"answerer: expected one of {names or 'those who answered, nobody yet'}, got {answerer!r}")
+        pairs, ties, sources = list[tuple[int, int]](), list[tuple[int, int]](), list[Source]()
+        for pair, source in zip((*self.pairs, *self.ties), self.rows(), strict=True):
+            if source.answerer != answerer:
+                left = ties if source.tied else pairs
+                sources.append(source._replace(number=len(left)))
+                left.append(pair)
+        answers = sum(source.side != 0 for source in sources)  # what was asked has a side
+        return replace(self, pairs=tuple(pairs), ties=tuple(ties), answers=answers, sources=tuple(sources))
 
     def _with_sources(
         self, before: "Preferences", asked: tuple[int, int], shown_first: int | None, answerer: str | None

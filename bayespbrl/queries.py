@@ -17,7 +17,7 @@ from scipy.special import entr
 
 from bayespbrl import checks
 from bayespbrl.models.likelihoods import Likelihood, prob
-from bayespbrl.preferences import Preferences, Query
+from bayespbrl.preferences import Answer, PastQuestion, Preferences, Query
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
 
@@ -27,6 +27,7 @@ MOST_OLDER = 20  # their draws would soon cost more than all else
 UNASKED_SIGNAL = 0.5  # from this signal on an iteration may ask nothing
 # An answer that is expected to tell less is not asked for: it changes what is known about one question in a hundred.
 LEAST_INFORMATION = 0.01 * math.log(2)
+LEAST_BETWEEN = 3  # questions between one and its repetition, so that the answer is not remembered
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class Questions:
       same_start: whether a newcomer is compared with a trajectory from the same start, where there is one: the better
         of two unlike starts says little about a policy. The paper compares it with the best of all.
       worthwhile: whether a question is left out whose answer is expected to tell less than `LEAST_INFORMATION`.
+      repeats: share of the questions that are an earlier one with sides swapped. They are for people: the answers tell
+        how consistent each is. They count for the budget of answers, and not as those of an iteration.
     """
 
     query: str = "highest-utility"
@@ -52,12 +55,14 @@ class Questions:
     answers: int | None = None
     same_start: bool = False
     worthwhile: bool = False
+    repeats: float = 0.0
 
     def __post_init__(self) -> None:
         checks.one_of("query", self.query, (*QUERY_RULES, "other"))
         checks.whole("queries_per_iteration", self.queries_per_iteration)
         checks.whole("first_queries", self.first_queries)
         checks.whole("unasked_iterations", self.unasked_iterations, 0)
+        checks.share("repeats", self.repeats, below_one=True)
         if self.answers is not None:
             checks.whole("answers", self.answers)
         for name in ("same_start", "worthwhile"):
@@ -77,7 +82,11 @@ class Questions:
 
     def within_budget(self, wanted: int, answers: int) -> int:
         """As many of `wanted` answers as the budget has left after so many."""
-        return wanted if self.answers is None else max(0, min(wanted, self.answers - answers))
+        return int(max(0, min(wanted, self.left(answers))))
+
+    def left(self, answers: int) -> float:
+        """How many answers the budget has left after so many."""
+        return math.inf if self.answers is None else self.answers - answers
 
 
 @dataclass(frozen=True)
@@ -241,6 +250,24 @@ def later_questions(rule: QueryRule, situation: QuerySituation, options: Questio
     worth = information is None or information >= LEAST_INFORMATION
     wanted = options.within_budget(options.queries_per_iteration, answers) if worth else 0
     return Chosen(wanted, order, opponents, information)
+
+
+def repeated(
+    past: Sequence[PastQuestion], number: int, options: Questions, *, left: float, rng: np.random.Generator
+) -> PastQuestion | None:
+    """The earlier question that question `number` repeats; None where a new one is due.
+
+    Args:
+      past: the questions so far that were answered.
+      left: answers of the budget that nothing else is wanted for.
+      rng: chooses among the last answerer's that have not been repeated, without the last few.
+    """
+    done = {question.repeats for question in past}
+    if len(done - {None}) >= int(options.repeats * number + 1e-9) or left < 1:
+        return None
+    new = [each for each in past[:-LEAST_BETWEEN] if each.repeats is None and each.answer is not Answer.SKIP]
+    suitable = [each for each in new if each.number not in done and each.answerer == past[-1].answerer]
+    return suitable[rng.integers(len(suitable))] if suitable else None
 
 
 def _ordered(

@@ -172,13 +172,15 @@ def test_a_run_without_out_gets_a_fresh_directory_under_runs(monkeypatch, tmp_pa
 def test_a_person_answers_at_the_prompt_stops_and_resumes(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     monkeypatch.setattr(sys, "stdin", io.StringIO("1\nx\nt\nq\n"))
-    status = call(monkeypatch, "run", "gridworld", *QUICK, "--expert", "terminal", "--out", out)
+    status = call(monkeypatch, "run", "gridworld", *QUICK, "--expert", "terminal", "--answerer", "Ada", "--out", out)
     shown = capsys.readouterr().out
     assert status == 130
     assert "resume" in shown
     assert (out / "query.png").read_bytes().startswith(b"\x89PNG")
     answered = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
-    assert [event["answer"] for event in answered if event["event"] == "answered"] == ["first", "tie"]
+    answered = [event for event in answered if event["event"] == "answered"]
+    assert [event["answer"] for event in answered] == ["first", "tie"]
+    assert all(event["answerer"] == "Ada" and event["seconds"] >= 0 for event in answered)
     monkeypatch.setattr(sys, "stdin", io.StringIO("2\n"))
     assert call(monkeypatch, "resume", out) == 0
     assert json.loads((out / "summary.json").read_text())["answers"] == 3
@@ -190,6 +192,9 @@ def test_a_person_answers_at_the_prompt_stops_and_resumes(monkeypatch, capsys, t
         (["run", "gridwurld"], "gridwurld"),
         (["run", "gridworld", "--utility", "magic"], "utility"),
         (["run", "gridworld", "--kl-bound", "-1"], "kl_bound"),
+        (["run", "gridworld", "--answerer", "Ada"], "answerer"),
+        (["run", "gridworld", "--expert", "terminal", "--answerer", " "], "answerer"),
+        (["run", "gridworld", "--repeats", "1.5"], "repeats"),
         (["run", "gridworld", "--kl-bound", "nan"], "kl_bound"),
         (["run", "gridworld", "--iterations", "0"], "iterations"),
         (["run", "gridworld", "--seed", "-1"], "seed"),

@@ -16,13 +16,15 @@ from bayespbrl.models import (
     joint_preference_model,
     posterior_draws,
     priors,
+    restored,
     sample_posterior,
+    stored,
 )
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import Convergence, chain_convergence
 from bayespbrl.models.gibbs import conditional
 from bayespbrl.models.posterior import SamplerOptions
-from bayespbrl.models.posterior_tree import bases_of
+from bayespbrl.models.posterior_tree import answers_of, bases_of
 
 INFERRED = {"steepness": None, "lapse_rate": None}
 SETTINGS = np.array([[[0.9], [0.4], [-0.2], [0.7]], [[0.1], [0.8], [1.3], [-0.3]]])
@@ -131,8 +133,64 @@ def test_ties_with_an_unknown_threshold_agree_with_quadrature():
 @pytest.mark.slow
 def test_a_side_bias_and_two_answerers_agree_with_quadrature():
     sides, answerers = np.array([1, -1, 1, 1]), np.array([0, 1, 1, 0])
-    tree = sample_posterior(SETTINGS[:1], **INFERRED, shown_first=sides, answerers=answerers, **SAMPLING)
-    agree(tree, quadrature(SETTINGS[:1], sides=sides, answerers=answerers)[0])
+    tree = sample_posterior(SETTINGS[:1], **INFERRED, shown_first=sides, **SAMPLING)
+    agree(tree, quadrature(SETTINGS[:1], sides=sides)[0])
+    tree = sample_posterior(SETTINGS[:1], **INFERRED, answerers=answerers, **SAMPLING)
+    agree(tree, quadrature(SETTINGS[:1], answerers=answerers)[0])
+
+
+def test_each_of_two_answerers_has_a_lapse_rate_and_a_side_bias_as_by_quadrature():
+    rows, sides, who = SETTINGS[0, :, 0], np.array([1, -1, 1, 1]), np.array([0, 1, 1, 0])
+    tree = sample_posterior(
+        SETTINGS[0], steepness=5.0, lapse_rate=None, likelihood="logistic", shown_first=sides, answerers=who, **SAMPLING
+    )
+    w, biases = np.linspace(-6, 6, 121), np.linspace(-4, 4, 33)
+    lapses, p_lapse = priors.LAPSE_RATE
+    values, weights = [], []
+    for b in itertools.product(biases, repeat=2):
+        margins = w[:, None] * rows + priors.SIDE_BIAS_SCALE * np.array(b)[who] * sides
+        p = lapses[:, None, None] / 2 + (1 - lapses[:, None, None]) * expit(5 * margins)  # (lapse, weight, answer)
+        each = [p[:, :, who == a].prod(axis=2) * p_lapse[:, None] for a in (0, 1)]
+        prior = np.exp(-0.5 * w**2 - 0.5 * np.sum(np.square(b)))
+        together = np.einsum("iw,jw,w->ijw", *each, prior)
+        weights.append(together.sum())
+        moments = [lapses @ together.sum(axis=(1, 2)), lapses @ together.sum(axis=(0, 2)), together.sum((0, 1)) @ w]
+        values.append(np.array(moments) / weights[-1])
+    weights = np.array(weights) / np.sum(weights)
+    expected_biases = priors.SIDE_BIAS_SCALE * weights @ np.array(list(itertools.product(biases, repeat=2)))
+    drawn = tree["posterior"].dataset
+    parts = [drawn["lapse_rate"].values, drawn["utility_weights"].values, drawn["side_bias"].values]
+    expected = [*(weights @ np.array(values)), *expected_biases]
+    together = np.concatenate(parts, axis=2)
+    error = chain_convergence(together).monte_carlo_error
+    assert np.all(np.abs(together.mean(axis=(0, 1)) - expected) < 4 * error + 2e-3)
+    np.testing.assert_allclose(
+        drawn["margins"].values, parts[1] * rows + np.take(parts[2], who, axis=2) * sides, atol=1e-9
+    )
+
+
+def test_the_side_bias_has_its_whole_prior_where_the_features_explain_the_answers_as_well():
+    tree = sample_posterior(np.array([[1.0, 0.0, 2.0]]), shown_first=np.array([1]), num_samples=1000, max_samples=1000)
+    drawn = tree["posterior"].dataset
+    bias, margins = drawn["side_bias"].values, drawn["utility_weights"].values @ np.array([1.0, 0.0, 2.0])
+    np.testing.assert_allclose(margins + bias, drawn["margins"].values[:, :, 0], atol=1e-9)
+    assert bias.std() == pytest.approx(priors.SIDE_BIAS_SCALE, rel=0.1)
+
+
+def test_names_are_kept_by_number_also_of_whom_no_answer_is_left():
+    rows, sides = SETTINGS[0], np.array([1, -1, 1, 1])
+    answers = Answers(None, sides, ["Bob", "Ada", "Ada", "Bob"]).checked(4)
+    assert (answers.answerers.tolist(), answers.names) == ([0, 1, 1, 0], ("Bob", "Ada"))
+    only = answers.of([0, 3])
+    tree = posterior_draws(rows[[0, 3]], PreferenceModel(lapse_rate=None), seed=1, answers=only)
+    drawn = restored(stored(tree))["posterior"].dataset
+    assert drawn["lapse_rate"].sel(answerer="Bob").dims == ("chain", "draw")
+    unseen = drawn.sel(answerer="Ada")  # all that is known is the prior
+    assert unseen["side_bias"].values.std() == pytest.approx(priors.SIDE_BIAS_SCALE, rel=0.1)
+    assert unseen["lapse_rate"].values.mean() == pytest.approx(priors.LAPSE_RATE.mean, abs=0.03)
+    assert answers_of(tree).names == ("Bob", "Ada")
+    with pytest.raises(ValueError, match="answerers: expected names among Bob, Ada, got Eve"):
+        Answers(answerers=["Eve"], names=("Bob", "Ada")).checked(1)
 
 
 def test_the_sampled_density_is_that_of_the_numpyro_model_named_in_the_documentation():

@@ -1,13 +1,21 @@
 """Answers of people: who gave each, how long it took, and what is kept of it."""
 
 import json
+from pathlib import Path
 
+import numpy as np
 import pytest
 from toys import QUICK, fingerprint
 
-from bayespbrl import Learner, Preferences, ReturnExpert, resume, start
+from bayespbrl import Answer, Learner, Preferences, ReturnExpert, load, queries, resume, start
+from bayespbrl.diagnostics import people
+from bayespbrl.diagnostics.report import document as report_document
+from bayespbrl.diagnostics.report.contents import read_contents
+from bayespbrl.diagnostics.report.people import people_warnings
+from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.events import Entry, LearnerState, apply
-from bayespbrl.preferences import Source
+from bayespbrl.models import sample_posterior
+from bayespbrl.preferences import PastQuestion, Source
 from bayespbrl.utility.comparisons import Comparisons
 
 OPTIONS = QUICK | {"iterations": 2}
@@ -107,7 +115,8 @@ def test_all_that_follows_from_an_answer_is_its_answerers_and_only_what_was_show
 def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
     trajectories, pairs = [object()] * 4, [(0, 1), (2, 1), (3, 0)]
     several = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob", "Ada", "Bob"])
-    assert several.answers.answerers.tolist() == [0, 1, 0]
+    checked = several.answers.checked(3)
+    assert (checked.answerers.tolist(), checked.names) == ([0, 1, 0], ("Bob", "Ada"))
     one = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob"] * 3)
     assert one.answers == Comparisons.among(trajectories, pairs, discount=1.0).answers
 
@@ -115,3 +124,186 @@ def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
 def test_nobody_has_answered_a_new_run_and_an_answer_without_a_name_is_somebodys():
     assert LearnerState("policy").preferences.answerers == ()
     assert Preferences(answers=1).answerers == (None,)
+
+
+def answering(run, choose, number=100, **who):
+    """Answer at most `number` questions by `choose`, and return them."""
+    asked = []
+    while len(asked) < number and (questions := run.ask()):
+        asked.append(questions[0])
+        run.tell([choose(questions[0])], **who)
+    return asked
+
+
+def always_the_first(query):
+    return "first"
+
+
+PEOPLE = OPTIONS | {"expert": "other", "iterations": 12, "max_steps": 5, "evaluation_episodes": 1}
+
+
+def test_a_share_of_the_questions_is_an_earlier_one_with_sides_swapped_and_its_answer_is_one_more():
+    run, _ = remembered(**PEOPLE, repeats=0.25)
+    asked = answering(run, always_the_first, answerer="Ada")
+    repeats = [query for query in asked if query.repeats is not None]
+    assert len(asked) == 13 + len(repeats)  # what an iteration wants is asked beside them
+    assert len(repeats) == len(asked) // 4
+    assert len({query.repeats for query in repeats}) == len(repeats)  # each once
+    for query in repeats:
+        earlier = asked[query.repeats - 1]
+        assert earlier.repeats is None
+        assert (query.first, query.second) == (earlier.second, earlier.first)
+        assert query.trajectories == earlier.trajectories[::-1]
+        assert query.number - earlier.number > queries.LEAST_BETWEEN
+        # whoever always chooses the first contradicts themselves: both answers are data
+        assert {(earlier.first, earlier.second), (query.first, query.second)} <= set(run.preferences.pairs)
+    assert run.preferences.answers == len(asked)
+    sides = [source.side for source in run.preferences.rows()]
+    assert set(sides) <= {1, 0}
+    assert sides.count(1) == len(asked)
+
+
+def test_repeated_questions_replay_and_undo(tmp_path):
+    straight = Learner("gridworld", **PEOPLE, repeats=0.25)
+    answering(straight, always_the_first)
+    run = start("gridworld", tmp_path / "run", **PEOPLE, repeats=0.25)
+    while (question := run.ask()[0]).repeats is None:
+        run.tell(["first"])
+    run.tell(["tie"])
+    assert run.preferences.ties[-1] == (question.first, question.second)
+    again = resume(tmp_path / "run")
+    assert (again.preferences, again.state.past) == (run.preferences, run.state.past)
+    again.undo()
+    (waiting,) = again.ask()
+    assert (waiting.number, waiting.first, waiting.repeats) == (question.number, question.first, question.repeats)
+    answering(again, always_the_first)
+    assert fingerprint(again) == fingerprint(straight)
+
+
+def test_a_repeated_question_that_nobody_can_answer_costs_nothing():
+    run, _ = remembered(**PEOPLE, repeats=0.25)
+    asked = answering(run, lambda query: "first" if query.repeats is None else "skip")
+    skipped = [query for query in asked if query.repeats is not None]
+    assert skipped
+    assert run.preferences.answers == 13 == len(asked) - len(skipped)
+
+
+def test_repeated_questions_stay_within_the_budget_and_are_of_the_one_who_answers():
+    run, _ = remembered(**PEOPLE, repeats=0.4, answers=9)
+    answering(run, always_the_first, 5, answerer="Ada")
+    asked = answering(run, always_the_first, 5, answerer="Bob")
+    assert run.preferences.answers == 9
+    past = {question.number: question for question in run.state.past}
+    later = [query for query in asked[1:] if query.repeats is not None]
+    assert all(past[query.repeats].answerer == "Bob" for query in later)
+
+
+def test_people_are_asked_a_tenth_again_and_a_simulated_expert_nothing():
+    assert Learner("gridworld", expert="other").settings.questions.repeats == 0.1
+    assert Learner("gridworld", expert="terminal", repeats=0.0).settings.questions.repeats == 0
+    assert Learner("gridworld").settings.questions.repeats == 0
+    with pytest.raises(ValueError, match=r"repeats: expected a number in \[0, 1\), got 1"):
+        Learner("gridworld", repeats=1)
+
+
+def test_what_repeats_no_earlier_question_is_refused():
+    run, _ = remembered()
+    answering(run, always_the_first, 1)
+    (first,) = run.state.past
+    waiting = run.ask()[0].number
+    event = {"event": "asked", "query": waiting, "first": first.first, "second": first.second, "newcomer": first.first}
+    with pytest.raises(ValueError, match="asked: expected a question that was asked before with sides swapped"):
+        apply(run.state, Entry(event | {"repeats": first.number}))
+
+
+# By hand: Ada is asked twice again and says the same once; Bob ties, cannot tell, and is asked a question of hers.
+PAST = (
+    PastQuestion(1, 0, 1, 1, None, Answer.FIRST, "Ada", 2.0),
+    PastQuestion(2, 2, 3, 3, None, Answer.SECOND, "Ada", 4.0),
+    PastQuestion(3, 4, 5, 5, None, Answer.TIE, "Bob", None),
+    PastQuestion(4, 6, 7, 7, None, Answer.SKIP, "Bob", 0.5),
+    PastQuestion(5, 1, 0, 1, 1, Answer.SECOND, "Ada", 3.0),
+    PastQuestion(6, 3, 2, 3, 2, Answer.SECOND, "Ada", 9.0),
+    PastQuestion(7, 1, 0, 1, 1, Answer.FIRST, "Bob", 1.5),
+)
+
+
+def test_the_figures_of_each_person_by_hand():
+    table = people(PAST)
+    assert table["answerer"].values.tolist() == ["Ada", "Bob"]
+    assert table["answers"].values.tolist() == [4, 2]
+    assert table["ties"].values.tolist() == [0, 1]
+    assert table["cannot_tell"].values.tolist() == [0, 1]
+    assert table["repeated"].values.tolist() == [2, 0]  # what another answered before says nothing of Bob
+    assert table["consistent"].values.tolist() == [1, 0]
+    assert table["seconds"].values.tolist() == [3.5, 1.0]
+    # Clopper and Pearson's interval of 1 of 2 at 90 %: the roots of (1 - p)² = 0.95 and p² = 0.95
+    lower, upper = 1 - np.sqrt(0.95), np.sqrt(0.95)
+    np.testing.assert_allclose(table["consistency_lower"].values, [lower, 0], atol=1e-9)
+    np.testing.assert_allclose(table["consistency_upper"].values, [upper, 1], atol=1e-9)
+    assert np.isnan(table["lapse_rate"]).all()
+    assert people(()).sizes["answerer"] == 0
+
+
+def test_lapse_rates_and_biases_are_each_persons_own():
+    differences = np.array([[1.0], [0.8], [-0.6], [0.5], [-0.9], [0.7]])
+    who, sides = ["Bob", "Ada", "Bob", "Ada", "Bob", "Ada"], np.array([1, -1, 1, 1, 1, -1])
+    tree = sample_posterior(differences, lapse_rate=None, shown_first=sides, answerers=who, num_samples=100)
+    table = people(PAST, tree)
+    for place, name in enumerate(("Ada", "Bob")):
+        for quantity in ("lapse_rate", "side_bias"):
+            draws = tree["posterior"][quantity].sel(answerer=name).values
+            found = [float(table[f"{quantity}{end}"][place]) for end in ("", "_lower", "_upper")]
+            np.testing.assert_allclose(found, [draws.mean(), *np.quantile(draws, [0.05, 0.95])])
+    assert table["lapse_rate"][1] > table["lapse_rate"][0]  # Bob contradicts the others
+
+
+@pytest.fixture(scope="module")
+def answered_by_two(tmp_path_factory) -> Path:
+    """A run of two people: Ada knows what is better, Bob always takes the first at once."""
+    directory = tmp_path_factory.mktemp("people") / "run"
+    options = {"preset": "paper", "hyperparameters": "inferred", "max_steps": 20, "evaluation_episodes": 2, "seed": 7}
+    run = start("gridworld", directory, **options, expert="other", repeats=0.25, iterations=6, first_queries=9)
+    turn = 0
+    while questions := run.ask():
+        turn += 1
+        if turn > 10:
+            run.tell(["first"], answerer="Bob", seconds=0.2)
+        else:
+            run.tell([ReturnExpert()(*questions[0].trajectories)], answerer="Ada", seconds=5.0)
+    return directory
+
+
+def test_the_report_of_a_run_of_people_says_what_to_do_about_each(answered_by_two, monkeypatch):
+    monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")  # the text alone is read
+    text = write_report(answered_by_two, format="md").read_text()
+    head, section = text[: text.index("## Learning curve")], text[text.index("## People") :]
+    section = section[: section.index("\n## ")]
+    rows = {line.split("|")[1].strip(): line for line in section.splitlines() if line.startswith("|")}
+    assert {"Ada", "Bob"} <= set(rows)
+    assert "| 5.0 s |" in rows["Ada"]
+    found = [warning.what for warning in people_warnings(read_contents(answered_by_two))]
+    assert all(what in head and what in section for what in found)
+    assert "Bob favours the trajectory shown first." in found
+    assert any(what.startswith("Bob took 0.2 s in the median") for what in found)
+    assert not any(what.startswith("Ada") for what in found)
+
+
+def test_a_run_of_the_simulated_expert_has_no_section_on_people(tmp_path, monkeypatch):
+    monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")
+    start("gridworld", tmp_path / "run", **OPTIONS).run(ReturnExpert())
+    assert "## People" not in write_report(tmp_path / "run", format="md").read_text()
+
+
+def test_the_utility_without_one_person_is_that_of_the_others(answered_by_two):
+    run = load(answered_by_two)
+    assert run.preferences.answerers == ("Ada", "Bob")
+    left = run.preferences.without("Bob")
+    assert left.answerers == ("Ada",)
+    assert left.answers == sum(q.answerer == "Ada" and q.answer is not Answer.SKIP for q in run.learner.state.past)
+    assert all(left.pairs[source.number] in run.preferences.pairs for source in left.sources if not source.tied)
+    estimate = run.estimate_without("Bob")
+    assert estimate.quality.pairs == len(left.pairs)
+    assert "answerer" not in estimate.posterior["posterior"].coords
+    with pytest.raises(ValueError, match="answerer: expected one of 'Ada', 'Bob', got 'Eve'"):
+        run.estimate_without("Eve")

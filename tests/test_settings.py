@@ -51,6 +51,7 @@ BAD = {
     "answers": [0, -1, 2.5, True],
     "same_start": [None, 1, "yes"],
     "worthwhile": [None, 1, "yes"],
+    "repeats": [None, 1, -0.1, "all"],
     "checked": [None, 1, "yes"],
     "critic_iterations": [0, -4, True, 2.0],
 }

@@ -31,6 +31,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+Answerer = Annotated[
+    str | None,
+    typer.Option(help="Your name or a pseudonym, where a person answers; kept with each answer."),
+]
 Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot, or any gymnasium id.")]
 
 
@@ -65,6 +69,8 @@ RUN_OPTIONS = {
     "policy": "Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.",
     "centres": "Number of radial basis functions of each kind of feature.",
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
+    "repeats": "Share of the questions that are an earlier one with sides swapped, which shows how consistent a person "
+    "is; 0.1 for people, 0 for a simulated expert.",
     "expert": "Who answers: return (simulated), page (you, in a browser) or terminal (you, at the prompt).",
 }
 
@@ -88,24 +94,27 @@ def run(
     *,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Run directory; a new one under runs/ if omitted.")] = None,
+    answerer: Answerer = None,
     **options: Any,
 ) -> None:
     """Learn a task from preferences; the run is kept in a directory."""
-    _check_expert(options.get("expert"))
+    _check_expert(options.get("expert"), answerer)
     directory = out or fresh_directory(env)
     learner = runs.start(env, directory, seed=seed, **options)
     with continuing(directory):
-        run_to_the_end(learner, directory)
+        run_to_the_end(learner, directory, answerer=answerer)
 
 
 @app.command()
-def resume(directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")]) -> None:
+def resume(
+    directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")], *, answerer: Answerer = None
+) -> None:
     """Continue an interrupted run; no answer is asked for twice."""
     with continuing(directory):
         learner = runs.resume(directory)
         if not learner.finished:
-            _check_expert(learner.settings.expert)
-            run_to_the_end(learner, directory)
+            _check_expert(learner.settings.expert, answerer)
+            run_to_the_end(learner, directory, answerer=answerer)
         elif not (directory / PICTURE).exists():  # interrupted before it was drawn, or run in Python
             show_run(learner, directory)
         else:
@@ -117,7 +126,7 @@ def ask(
     directory: Annotated[Path, typer.Argument(help="Directory of a run that a person answers.")],
     *,
     answers: Annotated[int | None, typer.Option(help="Most answers of this sitting.")] = None,
-    answerer: Annotated[str | None, typer.Option(help="Name of who answers, kept beside the answers.")] = None,
+    answerer: Answerer = None,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; a free one if omitted.")] = 0,
 ) -> None:
@@ -188,8 +197,12 @@ def main() -> None:
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _check_expert(name: str | None) -> None:
-    """Refuse an expert of the user's own, who cannot answer on the command line, and a page without what it needs."""
+def _check_expert(name: str | None, answerer: str | None) -> None:
+    """Refuse an expert who cannot answer here, a name for a simulated one, and a page without its extra."""
+    if answerer is not None:
+        checks.short_name("answerer", answerer)
+        if name not in ("terminal", "page"):
+            raise ValueError(f"answerer: expected a name with the expert page or terminal, got {answerer!r}")
     if name == "other":
         raise ValueError("expert: expected return, page or terminal, got other; continue in Python with Learner.run")
     if name == "page":

@@ -19,14 +19,18 @@ console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may conta
 PICTURE = "run.png"
 
 
-def run_to_the_end(learner: Learner, directory: Path) -> None:
-    """Run a learner that keeps its events in `directory` to its end, with its progress, then `show_run`."""
+def run_to_the_end(learner: Learner, directory: Path, *, answerer: str | None = None) -> None:
+    """Run a learner that keeps its events in `directory` to its end, with its progress, then `show_run`.
+
+    `answerer` is the name of the person who answers.
+    """
     if learner.settings.expert == "page":
-        return ask_on_page(learner, directory)
+        return ask_on_page(learner, directory, answerer=answerer)
     console.print(f"Run directory: {directory}")
     try:
         if learner.settings.expert == "terminal":
-            learner.run(_person(learner, directory), progress=lambda now: console.print(_state(now)))
+            person = _person(learner, directory)
+            learner.run(person, answerer=answerer, progress=lambda now: console.print(_state(now)))
         else:
             _run_with_bar(learner)
     except KeyboardInterrupt:

@@ -7,6 +7,7 @@ Each result is an xarray `Dataset`. Each plot function draws on the matplotlib a
   prequential     calibration: each answer predicted before it was used
   comparison      models compared by k-fold cross-validation
   leave_one_out   influence of each answer on the posterior
+  people          lapse rate, side bias and consistency of each answerer
   power_scaling   sensitivity to the prior scale and to the likelihood
   uncertainty     posterior draws of returns, rankings, Q and greedy actions
   estimates       what all of these ask of a utility estimate
@@ -18,6 +19,7 @@ Each result is an xarray `Dataset`. Each plot function draws on the matplotlib a
 from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ranks
 from bayespbrl.diagnostics.comparison import compare_likelihoods, plot_comparison
 from bayespbrl.diagnostics.leave_one_out import influence, plot_influence
+from bayespbrl.diagnostics.people import people
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.predictions import answer_probabilities
 from bayespbrl.diagnostics.prequential import calibration, plot_calibration, prequential_predictions, score_predictions
@@ -28,6 +30,7 @@ __all__ = [
     "compare_likelihoods",
     "convergence",
     "influence",
+    "people",
     "plot_calibration",
     "plot_comparison",
     "plot_convergence",

@@ -2,7 +2,11 @@
 
 from typing import TypeGuard
 
+import numpy as np
+
 from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
+from bayespbrl.models import Answers
+from bayespbrl.models.posterior_tree import answers_of
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEstimate
 
@@ -33,7 +37,18 @@ def number_of_features(estimate: StateUtility) -> int:
     return int(estimate.weights.shape[-1])
 
 
-def first_preferred_probability(estimate: UtilityEstimate, first: Trajectory, second: Trajectory) -> float:
-    """Posterior predictive probability that the first of two trajectories is preferred; needs a posterior."""
+def first_preferred_probability(
+    estimate: UtilityEstimate, first: Trajectory, second: Trajectory, *, answerer: str | None = None
+) -> float:
+    """Posterior predictive probability that the first of two trajectories, which is shown first, is preferred.
+
+    Args:
+      estimate: with a posterior.
+      answerer: who is asked; a name that the posterior does not know, or None, is any of its answerers.
+    """
     posterior = expect_posterior(estimate)
-    return float(answer_probabilities(posterior.posterior, posterior.differences([first, second]))[0, PREFERRED])
+    names = answers_of(posterior.posterior).names or ()
+    who = np.array([answerer]) if answerer in names else None
+    answers = Answers(shown_first=np.ones(1, int), answerers=who)
+    differences = posterior.differences([first, second])
+    return float(answer_probabilities(posterior.posterior, differences, answers)[0, PREFERRED])

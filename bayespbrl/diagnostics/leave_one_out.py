@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_probabilities, refit, tied_rows
-from bayespbrl.models.posterior_tree import settings_of
+from bayespbrl.models.posterior_tree import answers_of, bases_of, settings_of
 
 PARETO_K_LIMIT = 0.7
 
@@ -34,7 +34,7 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
     """
     number = tree["constant_data"].sizes["preference"]
     refits = None if refits is None else checks.whole("refits", refits, 0)
-    differences = np.asarray(tree["constant_data"]["differences"])
+    differences, answers = np.asarray(tree["constant_data"]["differences"]), answers_of(tree)
     margin_mean = np.asarray(tree["posterior"]["margins"]).mean(axis=(0, 1))
     pareto_k, estimated = _estimates(tree)
     chosen = np.argsort(-estimated, kind="stable")[:refits]
@@ -43,14 +43,9 @@ def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: 
     outcome = np.where(tied_rows(tree), TIED, PREFERRED)
     for k in chosen:
         others = refit(tree, np.arange(number) != k, **sampling_options)
-        weights = np.asarray(others["utility_weights_mean"])
-        means[k] = np.einsum("ckd,cd->k", settings_of(differences), np.atleast_2d(weights))
-        if "side_bias" in others["posterior"]:
-            means[k] += float(others["posterior"]["side_bias"].mean()) * np.asarray(
-                tree["constant_data"]["shown_first"]
-            )
+        means[k] = _mean_margins(others, answers.with_sides(settings_of(differences), others.attrs["prior_scale"]))
         changes[k] = _length(means[k] - margin_mean)
-        probability[k] = answer_probabilities(others, differences[..., [k], :])[0, outcome[k]]
+        probability[k] = answer_probabilities(others, differences[..., [k], :], answers.of([k]))[0, outcome[k]]
         converged[k] = bool(others.attrs["converged"])
     return xr.Dataset(
         {
@@ -93,6 +88,13 @@ def _estimates(tree: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
         weights = np.exp(log_weights - np.max(log_weights))
         change[k] = _length(weights @ draws / weights.sum() - draws.mean(axis=0))
     return pareto_k, change
+
+
+def _mean_margins(tree: xr.DataTree, rows: np.ndarray) -> np.ndarray:
+    """Mean of each margin, shape (K,), with `rows` (C, K, D and the sides); what no answer touches has the mean 0."""
+    z, settings = np.asarray(tree["posterior"]["coordinates"]), np.asarray(tree["posterior"]["setting"])
+    parts = [basis @ z[settings == c][:, : basis.shape[1]].sum(axis=0) for c, basis in enumerate(bases_of(tree))]
+    return np.asarray(np.einsum("ckd,cd->k", rows, np.array(parts)) / settings.size)
 
 
 def _length(change: np.ndarray) -> float:

@@ -4,7 +4,7 @@ Eq. 8 depends on the number of preferences K. Decision: each refit keeps the K o
 one model: the log probabilities of the answers, each given those before it, sum to its log marginal likelihood.
 """
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,22 +13,24 @@ import xarray as xr
 from bayespbrl.models import NOTHING_ELSE, Answers, PreferenceModel, posterior_draws
 from bayespbrl.models.likelihoods import likelihood_of, smoothed_probability
 from bayespbrl.models.posterior import SamplerOptions
-from bayespbrl.models.posterior_tree import answers_of, bases_of, settings_of
+from bayespbrl.models.posterior_tree import answers_of, bases_of, next_lapse_rates, settings_of
 
 PREFERRED, DOMINATED, TIED = 0, 1, 2
 MOST_DRAWS = 2000  # a probability is then known to a hundredth
 
 
-def answer_probabilities(tree: xr.DataTree, differences: np.ndarray) -> np.ndarray:
-    """Probability of each possible answer to comparisons that the posterior was not fitted to, without a side bias.
+def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: Answers = NOTHING_ELSE) -> np.ndarray:
+    """Probability of each possible answer to comparisons that the posterior was not fitted to.
 
     Only the part of a difference in the span of the fitted ones is averaged over draws. The utility of the rest has the
-    prior's normal distribution and is integrated exactly. Lapses are those of the first answerer.
+    prior's normal distribution and is integrated exactly.
 
     Args:
       tree: what `sample_posterior` returned.
       differences: ψ(one) − ψ(other) of n comparisons, in the units of the fitted differences, shape (n, D), or
         (C, n, D) where the fitted ones have settings.
+      answers: who answers, of those known to the tree, and which side the one is shown on. Without a side there is no
+        side bias; without an answerer the lapse rate is that of `next_lapse_rates`.
 
     Returns:
       shape (n, 3): the one is preferred, the other is preferred, no difference (0 where nothing was tied).
@@ -41,9 +43,14 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray) -> np.ndarr
     if asked.shape[0] != fitted.shape[0] or asked.shape[2] != fitted.shape[2]:
         expected = ("C", "n", fitted.shape[2]) if len(fitted) > 1 else ("n", fitted.shape[2])
         raise ValueError(f"differences: expected shape {expected}, got {np.shape(differences)}")
-    if "shown_first" in tree["constant_data"]:  # one feature more: the side
-        asked = np.concatenate([asked, np.zeros((*asked.shape[:2], 1))], axis=2)
-    draws, model = _every(tree), fitted_model(tree)
+    draws, model, who = _every(tree), fitted_model(tree), None
+    fitted_to = answers_of(tree)
+    if answers.answerers is not None and fitted_to.names is not None:
+        who = np.asarray(replace(answers, names=fitted_to.names).checked(asked.shape[1]).answerers)
+        draws["lapse_rate"] = draws["lapse_rates"][:, who]
+    if fitted_to.shown_first is not None:  # features more: the sides
+        sides = np.zeros(asked.shape[1], int) if answers.shown_first is None else answers.shown_first
+        asked = replace(fitted_to, shown_first=sides, answerers=who).with_sides(asked, model.prior_scale)
     probabilities = np.zeros((asked.shape[1], 3))
     for number, (basis, rows) in enumerate(zip(bases_of(tree), asked, strict=True)):
         chosen = draws["setting"] == number
@@ -52,7 +59,8 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray) -> np.ndarr
         inside = rows @ basis
         margins = draws["coordinates"][chosen][:, : basis.shape[1]] @ inside.T
         spread = model.prior_scale * np.linalg.norm(rows - inside @ basis.T, axis=1)
-        values = {name: values[chosen][:, None] for name, values in draws.items() if name in PARAMETERS}
+        values = {name: draws[name][chosen] for name in PARAMETERS if name in draws}
+        values = {name: value if value.ndim == 2 else value[:, None] for name, value in values.items()}
         threshold = values.pop("tie_threshold", np.zeros((1, 1)))
         likelihood = likelihood_of(model.likelihood, number_of_preferences(tree), **values)
         for column, side in ((PREFERRED, 1.0), (DOMINATED, -1.0)):
@@ -71,7 +79,7 @@ def _every(tree: xr.DataTree) -> dict[str, np.ndarray]:
     apart = -(-drawn["setting"].size // MOST_DRAWS)
     names = [name for name in ("setting", "coordinates", *PARAMETERS) if name in drawn]
     parts = {name: drawn[name].values[:, ::apart] for name in names}
-    parts["lapse_rate"] = parts["lapse_rate"][:, :, 0]
+    parts["lapse_rates"], parts["lapse_rate"] = parts["lapse_rate"], next_lapse_rates(tree)[:, ::apart]
     draws = parts["setting"].size
     return {name: part.reshape(draws, *part.shape[2:]) for name, part in parts.items()}
 
@@ -100,8 +108,10 @@ def held_out_probabilities(
       `answer_probabilities` (n, 3) of the asked rows, and whether the sampler converged.
     """
     number = differences.shape[-2] if number_of_preferences is None else number_of_preferences
+    answers = answers.checked(differences.shape[-2])
     tree = _fit(differences[..., used, :], model, answers.of(used), number, **sampling_options)
-    return answer_probabilities(tree, differences[..., asked, :]), bool(tree.attrs["converged"])
+    probabilities = answer_probabilities(tree, differences[..., asked, :], answers.of(asked))
+    return probabilities, bool(tree.attrs["converged"])
 
 
 def refit(tree: xr.DataTree, used: np.ndarray, **sampling_options: int) -> xr.DataTree:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax, random
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Shaped
 from scipy.special import softmax
 
 from bayespbrl.models.elliptical_slice import Ellipse
@@ -65,16 +65,16 @@ class Chains:
         num_chains: int,
         chunk: int,
         seed: int,
-        answerers: Int[np.ndarray, " k"] | None = None,
+        by_answerer: Float[np.ndarray, "a k"] | None = None,
     ) -> "Chains":
         """Chains that start far apart: at draws of the reference, of the unknowns' priors, and of the settings.
 
         Args:
           fits: one for each setting, equally probable a priori.
           num_chains, chunk, seed: numbers of chains and of draws a call; of all draws.
-          answerers: who gave each answer, 0 to A − 1; None: one for all.
+          by_answerer: who gave each answer, one-hot; None: one for all.
         """
-        problem, rank = joint_problem(fits, answerers), max(fit.factors.loadings.shape[1] for fit in fits)
+        problem, rank = joint_problem(fits, by_answerer), max(fit.factors.loadings.shape[1] for fit in fits)
         rng = np.random.default_rng(seed)
         # likely settings, but spread wider than the posterior over them: chains that agree have forgotten their start
         setting = rng.choice(len(fits), num_chains, p=softmax([0.5 * fit.log_evidence for fit in fits]))
@@ -112,14 +112,15 @@ class Chains:
         return np.asarray(getattr(self.problem, name).values)[self.collected(name, length)]
 
 
-def joint_problem(fits: Sequence[GaussianFit], answerers: Int[np.ndarray, " k"] | None = None) -> JointProblem:
+def joint_problem(fits: Sequence[GaussianFit], by_answerer: Float[np.ndarray, "a k"] | None = None) -> JointProblem:
     """The problem of all settings, with the references of their fits."""
     model, likelihood = fits[0].model, fits[0].likelihood
     rank = max(fit.factors.loadings.shape[1] for fit in fits)
     problems = [_with_reference(fit, rank) for fit in fits]
-    numbers = np.zeros(len(fits[0].differences), dtype=int) if answerers is None else answerers
-    one_hot = np.zeros((max(numbers, default=0) + 1, problems[0].loadings.shape[0]))
-    one_hot[numbers, np.arange(len(numbers))] = 1.0
+    number = len(fits[0].differences)
+    known = np.ones((1, number)) if by_answerer is None else by_answerer
+    one_hot = np.zeros((len(known), problems[0].loadings.shape[0]))
+    one_hot[:, :number] = known
 
     def table(prior: Grid) -> Table:
         return Table(jnp.asarray(prior.values), jnp.log(jnp.asarray(prior.probabilities)))

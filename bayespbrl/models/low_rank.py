@@ -59,7 +59,7 @@ def used_rows(loadings: Float[np.ndarray, "k r"]) -> Bool[np.ndarray, " k"]:
 class UtilityWeights(BackendArray):
     """Draws of w = Q z + σ (I − QQᵀ) ε, of shape (chain, draw, feature), with the Q of each draw's setting.
 
-    They are computed where they are indexed.
+    They are computed where they are indexed, and multiplied by a unit.
 
     ε comes from a counter-based generator keyed by the seed, the chain and the draw, so that a draw is the same array
     however it is indexed.
@@ -73,9 +73,10 @@ class UtilityWeights(BackendArray):
         *,
         prior_scale: float,
         seed: int,
+        unit: float = 1.0,
     ) -> None:
         self.coordinates, self.bases, self.settings = coordinates, bases, settings
-        self.prior_scale, self.seed = prior_scale, seed
+        self.prior_scale, self.seed, self.unit = prior_scale, seed, unit
         self.shape = (*coordinates.shape[:2], len(bases[0]))
         self.dtype = np.dtype(np.float64)
 
@@ -90,7 +91,7 @@ class UtilityWeights(BackendArray):
         weights = np.empty((len(chains), len(draws), self.shape[2]))
         for i, chain in enumerate(chains):
             for j, draw in enumerate(draws):
-                weights[i, j] = self.draw(int(chain), int(draw))
+                weights[i, j] = self.unit * self.draw(int(chain), int(draw))
         keep = tuple(0 if np.ndim(k) == 0 and not isinstance(k, slice) else slice(None) for k in key[:2])
         return weights[(*keep, key[2])]
 

@@ -74,7 +74,8 @@ def sample_posterior(
       tie_threshold: δ > 0: margins within it are often called ties. None: inferred where `indifferent` is given.
       shown_first: 1 where the preferred one was shown first, −1 where the other was, 0 where nothing is known, shape
         (K,). The margin by which the answerer favours the first shown is then inferred. None: nobody does.
-      answerers: who gave each answer, numbers from 0, shape (K,): each has a lapse rate. None: one for all.
+      answerers: who gave each answer, names or numbers from 0, shape (K,): each has a lapse rate and a side bias, under
+        one prior. None: one answerer.
       number_of_preferences: K of eq. 8, where it is not the number of rows (an answer held out).
       num_warmup: draws a chain that are discarded (burn-in); rounded up to whole chunks of min(num_samples, 25) draws.
       num_samples: draws a chain to begin with, >= 4.
@@ -86,8 +87,8 @@ def sample_posterior(
       A tree with the groups
       `posterior`: margins (chain, draw, preference); coordinates z (chain, draw, coordinate); setting (chain, draw);
         steepness (chain, draw); lapse_rate (chain, draw, answerer); tie_threshold (chain, draw) where there are ties;
-        side_bias (chain, draw) where `shown_first` is known; and utility_weights (chain, draw, feature), those of the
-        draw's setting, which are computed when indexed;
+        side_bias (chain, draw) where `shown_first` is known, with a dimension answerer where `answerers` are; and
+        utility_weights (chain, draw, feature), those of the draw's setting; the last two are computed when indexed;
       `sample_stats`: lp (log likelihood), candidates (per move), stuck, diverging (a likelihood of zero or NaN);
       `log_likelihood`: answers (chain, draw, preference); `observed_data`: answers, 1 as given and 0 for a tie;
       `constant_data`: differences, with a dimension `setting` in front where they had one; shown_first, answerers;
@@ -136,7 +137,7 @@ def posterior_draws(
             num_chains=sampler.num_chains,
             chunk=min(sampler.num_samples, CHUNK),
             seed=seed,
-            answerers=None if answers.answerers is None else np.asarray(answers.answerers),
+            by_answerer=answers.by_answerer(settings.shape[1]),
         )
         chains = replace(chains.extended(sampler.num_warmup), draws=())
         wanted = sampler.num_samples

@@ -81,12 +81,14 @@ def posterior_tree(
     }
     if isinstance(likelihood, WithTies):
         draws["tie_threshold"] = (SAMPLE, chains.values("tie_threshold", length))
-    known = {name: ("preference", x) for name, x in asdict(answers).items() if x is not None and name != "indifferent"}
+    parts = {"shown_first": answers.shown_first, "answerers": answers.answerers}
+    known = {name: ("preference", x) for name, x in parts.items() if x is not None}
+    people = {} if answers.names is None else {"answerer": np.array(answers.names, dtype=object)}
     dimensions = ("setting", "preference", "feature")[3 - differences.ndim :]
     tree = xr.DataTree.from_dict(
         {
             "/": xr.Dataset(attrs=root_attributes),
-            "/posterior": xr.Dataset(draws, labels),
+            "/posterior": xr.Dataset(draws, labels | people),
             "/sample_stats": xr.Dataset({"lp": (SAMPLE, lp), **flags}, labels),
             "/log_likelihood": xr.Dataset({"answers": (answer, log_p)}, labels),
             "/observed_data": xr.Dataset({"answers": ("preference", (~tied).astype(np.int8))}),
@@ -98,14 +100,28 @@ def posterior_tree(
 
 def answers_of(tree: xr.DataTree) -> Answers:
     """What is known of the answers that a tree was fitted to."""
-    known = tree.children["constant_data"].dataset
+    known, drawn = tree.children["constant_data"].dataset, tree.children["posterior"].dataset
     tied = np.asarray(tree.children["observed_data"]["answers"]) == 0
     parts = {name: known[name].values.astype(int) for name in ("shown_first", "answerers") if name in known}
-    return Answers(tied if "tie_threshold" in tree.children["posterior"].dataset else None, **parts)
+    names = tuple(map(str, drawn["answerer"].values)) if "answerer" in drawn.coords else None
+    return Answers(tied if "tie_threshold" in drawn else None, **parts, names=names)
+
+
+def next_lapse_rates(tree: xr.DataTree) -> Float[np.ndarray, "chain draw"]:
+    """The lapse rate of an answer by one of the answerers, each as probable as their share of the answers.
+
+    The probability of an answer is linear in the lapse rate, so that this mean is exact.
+    """
+    rates, known = tree.children["posterior"].dataset["lapse_rate"].values, answers_of(tree)
+    if rates.shape[2] == 1:
+        return np.asarray(rates[:, :, 0])
+    counts = np.bincount(np.asarray(known.answerers), minlength=rates.shape[2])
+    shares = counts / counts.sum() if counts.any() else np.full(rates.shape[2], 1 / rates.shape[2])
+    return np.asarray(rates @ shares)
 
 
 def bases_of(tree: xr.DataTree) -> list[Float[np.ndarray, "d r"]]:
-    """Q of each setting, of the features and, where there is one, the side."""
+    """Q of each setting, of the features and, where they are known, the sides."""
     settings = settings_of(tree.children["constant_data"].dataset["differences"].values)
     augmented = answers_of(tree).with_sides(settings, float(tree.attrs["prior_scale"]))
     return [low_rank(each).basis for each in augmented]
@@ -129,17 +145,16 @@ def _with_weights(tree: xr.DataTree, bases: Sequence[Float[np.ndarray, "d _"]]) 
     z, settings = posterior["coordinates"].values, posterior["setting"].values
     differences = tree.children["constant_data"].dataset["differences"]
     width, several = differences.shape[-1], differences.ndim == 3
-    lazy = UtilityWeights(
-        z, bases, settings, prior_scale=float(tree.attrs["prior_scale"]), seed=int(tree.attrs["seed"])
-    )
-    weights = xr.Variable((*SAMPLE, "feature"), indexing.LazilyIndexedArray(lazy))
-    posterior = posterior.assign(utility_weights=weights[:, :, :width])
+    scale, seed = float(tree.attrs["prior_scale"]), int(tree.attrs["seed"])
+
+    def lazy(unit: float, dimension: str) -> xr.Variable:
+        weights = UtilityWeights(z, bases, settings, prior_scale=scale, seed=seed, unit=unit)
+        return xr.Variable((*SAMPLE, dimension), indexing.LazilyIndexedArray(weights))
+
+    posterior = posterior.assign(utility_weights=lazy(1.0, "feature")[:, :, :width])
     if "shown_first" in tree.children["constant_data"].dataset:
-        rows = np.zeros(z.shape)
-        for number, basis in enumerate(bases):
-            rows[settings == number, : basis.shape[1]] = basis[-1]
-        scale = SIDE_BIAS_SCALE / float(tree.attrs["prior_scale"])
-        posterior = posterior.assign(side_bias=(SAMPLE, scale * np.sum(rows * z, axis=2)))
+        sides = lazy(SIDE_BIAS_SCALE / scale, "answerer")[:, :, width:]
+        posterior = posterior.assign(side_bias=sides if "answerer" in posterior.coords else sides[:, :, 0])
     lp = tree.children["sample_stats"].dataset["lp"].values
     best = np.zeros(lp.shape, bool)
     best[np.unravel_index(np.argmax(lp), lp.shape)] = True

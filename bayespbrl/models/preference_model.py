@@ -1,6 +1,6 @@
 """The model of Bayesian PBIRL (eqs. 7-8): its options, and its form in NumPyro."""
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -93,35 +93,66 @@ class Answers:
 
     Attributes:
       indifferent, shown_first, answerers: as of `sample_posterior`, shape (K,).
+      names: of the answerers, by number; None: found in `answerers`, or there is one answerer.
     """
 
     indifferent: ArrayLike | None = None
     shown_first: ArrayLike | None = None
     answerers: ArrayLike | None = None
+    names: tuple[str, ...] | None = None
 
     def checked(self, number: int) -> "Answers":
         """The same as arrays; `ValueError` where one is not of shape (`number`,) or not of its kind."""
-        tied, sides, who = self.indifferent, self.shown_first, self.answerers
+        tied, sides, who, names = self.indifferent, self.shown_first, self.answerers, self.names
+        if who is not None:
+            who, names = _numbered(np.asarray(who), names, number)
         return Answers(
             None if tied is None else checks.flags("indifferent", tied, number),
-            None if sides is None else _numbers("shown_first", sides, number, -1, 1).astype(float),
-            None if who is None else _numbers("answerers", who, number, 0, number),
+            None if sides is None else _numbers("shown_first", sides, number, -1, 1),
+            who,
+            names,
         )
 
-    def of(self, rows: np.ndarray) -> "Answers":
-        """Those of some rows."""
-        return Answers(*(None if part is None else np.asarray(part)[rows] for part in astuple(self)))
+    def of(self, rows: ArrayLike) -> "Answers":
+        """Those of some rows; the answerers keep their numbers."""
+        chosen = np.asarray(rows)
+
+        def some(part: ArrayLike | None) -> np.ndarray | None:
+            return None if part is None else np.asarray(part)[chosen]
+
+        return Answers(some(self.indifferent), some(self.shown_first), some(self.answerers), self.names)
+
+    def by_answerer(self, number: int) -> Float[np.ndarray, "a k"]:
+        """Who gave each of K answers, one-hot; zero where that is not known."""
+        if self.answerers is None:
+            return np.ones((1, number)) if self.names is None else np.zeros((len(self.names), number))
+        who = np.asarray(self.answerers)
+        many = int(who.max(initial=0)) + 1 if self.names is None else len(self.names)
+        return (np.arange(many)[:, None] == who).astype(float)
 
     def with_sides(self, differences: Float[np.ndarray, "*s k d"], prior_scale: float) -> Float[np.ndarray, "*s k e"]:
-        """The differences with one more feature, the side, whose weight is the side bias over its scale."""
+        """The differences with a feature for each answerer: the side, whose weight is the side bias over its scale."""
         if self.shown_first is None:
             return differences
-        column = np.asarray(self.shown_first) * priors.SIDE_BIAS_SCALE / prior_scale
-        column = np.broadcast_to(column[:, None], (*differences.shape[:-1], 1))
-        return np.concatenate([differences, column], axis=-1)
+        columns = (np.asarray(self.shown_first) * self.by_answerer(differences.shape[-2])).T
+        columns = columns * priors.SIDE_BIAS_SCALE / prior_scale
+        columns = np.broadcast_to(columns, (*differences.shape[:-1], columns.shape[1]))
+        return np.concatenate([differences, columns], axis=-1)
 
 
 NOTHING_ELSE = Answers()
+
+
+def _numbered(who: np.ndarray, names: tuple[str, ...] | None, number: int) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The number of each of K answerers, who are given by name or by number, and the names by number."""
+    if who.shape == (number,) and number and all(isinstance(each, str) for each in who):
+        given = [str(each) for each in who]
+        names = tuple(dict.fromkeys(given)) if names is None else names
+        if unknown := sorted(set(given) - set(names)):
+            raise ValueError(f"answerers: expected names among {', '.join(names)}, got {', '.join(unknown)}")
+        who = np.array([names.index(each) for each in given])
+    who = _numbers("answerers", who, number, 0, number if names is None else len(names) - 1)
+    return who, tuple(map(str, range(int(who.max(initial=0)) + 1))) if names is None else names
 
 
 def _numbers(name: str, values: ArrayLike, number: int, least: int, most: int) -> np.ndarray:
@@ -170,7 +201,7 @@ def joint_preference_model(
 
     Sites: `setting`, and `steepness_number`, `lapse_rate_number` (one for each answerer, plate "answerer") and
     `tie_threshold_number`, the numbers of the values on their grids; then those of `preference_model`, whose
-    `utility_weights` have one feature more where `shown_first` is known: the side.
+    `utility_weights` have one feature more for each answerer where `shown_first` is known: the side.
 
     Args:
       differences: for C settings, equally probable a priori.
@@ -180,7 +211,8 @@ def joint_preference_model(
     """
     settings = jnp.asarray(answers.with_sides(differences, model.prior_scale))
     number = settings.shape[1] if number_of_preferences is None else number_of_preferences
-    who = np.zeros(settings.shape[1], int) if answers.answerers is None else np.asarray(answers.answerers)
+    by_answerer = answers.by_answerer(settings.shape[1])
+    who = np.argmax(by_answerer, axis=0)
 
     def one_of(name: str, prior: Grid) -> Array:
         chosen = numpyro.sample(f"{name}_number", dist.Categorical(jnp.asarray(prior.probabilities)))
@@ -188,7 +220,7 @@ def joint_preference_model(
 
     setting = numpyro.sample("setting", dist.Categorical(jnp.full(len(settings), 1 / len(settings))))
     steepness = one_of("steepness", model.steepness_prior)
-    with numpyro.plate("answerer", int(who.max(initial=0)) + 1):
+    with numpyro.plate("answerer", len(by_answerer)):
         lapse_rates = one_of("lapse_rate", model.lapse_rate_prior)
     ties = answers.indifferent is not None or model.tie_threshold is not None
     likelihood = likelihood_of(

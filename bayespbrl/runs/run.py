@@ -1,6 +1,6 @@
 """A run on disk: start it, resume it, load it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -172,6 +172,15 @@ class Run:
     def posterior(self) -> xr.DataTree | None:
         """Posterior draws of the last fit in ArviZ's schema; None where the estimate is no posterior."""
         return None if self.estimate is None else self.estimate.posterior
+
+    def estimate_without(self, answerer: str) -> UtilityEstimate:
+        """The utility inferred again from the answers of all others; the run is not changed.
+
+        Raises:
+          ValueError: a name that nobody who answered has.
+        """
+        state = self.learner.state
+        return self.learner.cycle.estimate(replace(state, preferences=state.preferences.without(answerer)))
 
     def evaluate(self, episodes: int = 100, seed: int = 0) -> float:
         """Mean undiscounted return of `policy`, which is stochastic, over fresh episodes."""

@@ -110,6 +110,7 @@ DEFAULT: dict[str, Any] = {
     "fixed_point_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
     "projection_ridge": 1e-5,
 }
+REPEATS = 0.1  # of the questions to people; a simulated expert would only repeat itself
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,8 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     if checks.one_of("preset", chosen.get("preset", "default"), NAMES) == "paper":
         return {"hyperparameters": "given"} | PAPER.get(name, {})
     options = DEFAULT | ({} if task is None else task.derived()) | TASKS.get(name, {})
+    if chosen.get("expert", "return") != "return":
+        options["repeats"] = REPEATS
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":
         options["query"] = "highest-utility"
     return options

@@ -37,7 +37,7 @@ class Comparisons:
         discount: float,
         ties: Sequence[tuple[int, int]] = (),
         sides: Sequence[int] | None = None,
-        answered_by: Sequence[str | None] | None = None,
+        answered_by: Sequence[str] | None = None,
     ) -> "Comparisons":
         """Those of `trajectories` that `pairs` and `ties` name, or the first where they name none.
 
@@ -46,7 +46,7 @@ class Comparisons:
           pairs, ties: of their numbers.
           discount: γ of ψ.
           sides: of the pairs and then the ties, as of `Source`; where there are any, a side bias is inferred.
-          answered_by: names, of the pairs and then the ties; each of several answerers has a lapse rate.
+          answered_by: names, of the pairs and then the ties; each of several has a lapse rate and a side bias.
         """
         every = (*pairs, *ties)
         numbers = sorted({number for pair in every for number in pair} or {0})
@@ -59,7 +59,7 @@ class Comparisons:
             Answers(
                 indifferent=tied if ties else None,
                 shown_first=None if sides is None or not any(sides) else np.array(sides),
-                answerers=None if answered_by is None else _numbered(answered_by),
+                answerers=None if answered_by is None or len(set(answered_by)) < 2 else np.array(answered_by),
             ),
         )
 
@@ -76,12 +76,6 @@ class Comparisons:
     def differences(self, feature_sums: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
         """ψ(preferred) − ψ(dominated) of each pair."""
         return pair_differences(self.pairs, feature_sums)
-
-
-def _numbered(names: Sequence[str | None]) -> np.ndarray | None:
-    """The number of each name, in the order in which they come first; None for fewer than two."""
-    known = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    return np.array([known[name] for name in names]) if len(known) > 1 else None
 
 
 def normalised(differences: Float[np.ndarray, "k d"]) -> tuple[Float[np.ndarray, "k d"], float]:

@@ -97,7 +97,8 @@ def infer_utility(
       pairs: ordered pairs (preferred, dominated) of their row numbers.
       ties: pairs that were answered with "no difference". There are K pairs and ties in all.
       shown_first: as of `sample_posterior`, for the pairs and then the ties: a side bias is inferred.
-      answerers: as of `sample_posterior`: each has a lapse rate.
+      answerers: who gave each answer, names or numbers from 0, in the same order: each has a lapse rate and, with
+        `shown_first`, a side bias. `posterior["posterior"]["lapse_rate"].sel(answerer="Ada")` are the draws of one.
       features: φ, where utilities of single states are wanted too; None: the rows themselves.
       method: `posterior-mean`; `most-likely`; `posterior-draw`, one draw picked by `seed`, with directions that the
         answers do not touch at their mean, zero; or `linear-program`, which leaves ties out.

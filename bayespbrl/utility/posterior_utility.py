@@ -11,6 +11,7 @@ from xarray import DataTree
 from bayespbrl import checks
 from bayespbrl.features import StateFeatures
 from bayespbrl.models.likelihoods import Likelihood, likelihood_of
+from bayespbrl.models.posterior_tree import next_lapse_rates
 from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
 from bayespbrl.utility.length_scales import rescaled
 from bayespbrl.utility.quality import FitQuality
@@ -53,8 +54,7 @@ class PosteriorUtility:
         drawn, fitted = self.posterior.children["posterior"].dataset, self.posterior.attrs
         apart = slice(None, None, self._apart(number))
         steepness, lapse_rate = (
-            drawn[name].values.reshape(*drawn["setting"].shape, -1)[:, apart, 0].reshape(-1, 1)
-            for name in ("steepness", "lapse_rate")
+            values[:, apart].reshape(-1, 1) for values in (drawn["steepness"].values, next_lapse_rates(self.posterior))
         )
         return likelihood_of(
             fitted["likelihood"],
@@ -104,11 +104,14 @@ class PosteriorUtility:
         return np.array([(each[:1] - each[1:]) / scale for each, scale in zip(sums, self.scales, strict=True)])
 
     def hyperparameters(self) -> dict[str, Any]:
-        """Mean and 90 % interval of all that was inferred beside the weights, as plain data."""
+        """Mean and 90 % interval of all that was inferred beside the weights, as plain data.
+
+        Of several answerers the lapse rate is that of `next_lapse_rates`, and the side bias is the mean.
+        """
         drawn = self.posterior.children["posterior"].dataset
-        columns = {
-            name: drawn[name].values.reshape(drawn["setting"].size, -1)[:, 0]
-            for name in ("lapse_rate", "steepness", "tie_threshold", "side_bias")
+        columns = {"lapse_rate": next_lapse_rates(self.posterior).ravel()} | {
+            name: drawn[name].values.reshape(drawn["setting"].size, -1).mean(axis=1)
+            for name in ("steepness", "tie_threshold", "side_bias")
             if name in drawn
         }
         figures: dict[str, Any] = {name: float(values.mean()) for name, values in columns.items()}

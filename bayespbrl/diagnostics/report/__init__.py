@@ -3,7 +3,7 @@
 write                       reads a run, fills the template, writes the file
 contents, log               what can be read of a run directory
 tables, figures             data sets, and figures of them
-sections, answers, utility  the sections
+sections, answers, utility, people   the sections
 summary, warnings           the sentences and warnings at the head
 document, formatting        a report as data, and numbers as text
 """

@@ -21,7 +21,7 @@ from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
 from bayespbrl.envs.opening import environment_attribute, open_environment
 from bayespbrl.features import StateFeatures, checked_features
 from bayespbrl.models import PreferenceModel
-from bayespbrl.preferences import Preferences
+from bayespbrl.preferences import PastQuestion, Preferences
 from bayespbrl.runs.directory import RunDirectory
 from bayespbrl.runs.iteration_files import read_parts
 from bayespbrl.settings import Settings
@@ -37,7 +37,7 @@ class RunContents:
     Attributes:
       path, settings: of the run.
       iterations: summaries of the completed iterations.
-      answers: in their order, without those taken back.
+      answers: in their order, without those taken back; `past` are the same, as the learner keeps them.
       preferences: those that follow from the answers.
       trajectories: by number, those that can be read.
       estimate: the newest utility estimate that can be read, of iteration `estimate_iteration`; None and 0 without any.
@@ -51,6 +51,7 @@ class RunContents:
     settings: Settings
     iterations: tuple[Summary, ...] = ()
     answers: tuple[AnsweredQuestion, ...] = ()
+    past: tuple[PastQuestion, ...] = ()
     preferences: Preferences = field(default_factory=Preferences)
     trajectories: Mapping[int, Trajectory] = field(default_factory=dict)
     estimate: UtilityEstimate | None = None
@@ -113,6 +114,7 @@ def read_contents(
         settings=run.settings,
         iterations=log.summaries,
         answers=log.answers,
+        past=log.state.past,
         preferences=log.state.preferences,
         open_question=None if log.state.query is None else log.state.query.number,
         damage=log.damage,
@@ -176,7 +178,7 @@ def _predicted(contents: RunContents, answer: AnsweredQuestion) -> AnsweredQuest
         return replace(answer, predicted=0.5)  # without any answer, either is equally probable
     if contents.posterior is None or contents.features_missing:
         return answer
-    return replace(answer, predicted=first_preferred_probability(contents.estimate, *both))
+    return replace(answer, predicted=first_preferred_probability(contents.estimate, *both, answerer=answer.answerer))
 
 
 def _damaged(contents: RunContents, what: str, remedy: str) -> RunContents:

@@ -32,6 +32,7 @@ class AnsweredQuestion:
       row: which of the K ordered pairs it is; None where it gave none (a tie, a skip).
       predicted: probability that the first is preferred, by the estimate that the learner had when it asked; NaN where
         that has no posterior or cannot be read.
+      answerer, seconds: who answered, and how long they took; None where that is not known.
     """
 
     question: int
@@ -41,6 +42,8 @@ class AnsweredQuestion:
     answer: Answer
     row: int | None
     predicted: float = float("nan")
+    answerer: str | None = None
+    seconds: float | None = None
 
     @property
     def before(self) -> float:
@@ -121,7 +124,9 @@ def _applied(
             after = len(state.preferences.pairs)
             row = after - 1 if after > pairs else None  # the pair that was asked about is the last of its answer's
             answer = Answer(event["answer"])
-            answers.append(AnsweredQuestion(query.number, state.iteration + 1, query.first, query.second, answer, row))
+            who = {name: event[name] for name in ("answerer", "seconds") if name in event}
+            shown = (query.first, query.second)
+            answers.append(AnsweredQuestion(query.number, state.iteration + 1, *shown, answer, row, **who))
     return state, answers
 
 

@@ -9,6 +9,7 @@ from gymnasium.spaces import Discrete
 from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.formatting import count, number
+from bayespbrl.diagnostics.report.people import has_people, people_warnings
 from bayespbrl.diagnostics.report.summary import ENOUGH_PREDICTIONS
 from bayespbrl.preferences import Answer
 
@@ -33,6 +34,7 @@ def find_warnings(
     if iterations.sizes["iteration"]:
         found += [*_of_fits(contents, iterations), *_of_updates(iterations), *_of_fitted_policy(iterations)]
         found += [*_of_entropy(contents, iterations), *_of_value(iterations)]
+    found += people_warnings(contents) if has_people(contents) else []
     return [*found, *_of_answers(contents, answers), *_of_predictions(scores)]
 
 

@@ -16,6 +16,7 @@ from bayespbrl import checks
 from bayespbrl.diagnostics.report import answers, sections, tables, utility
 from bayespbrl.diagnostics.report.contents import RunContents, read_contents
 from bayespbrl.diagnostics.report.document import Body, Comparison, Picture, Report, ReportWarning, Section
+from bayespbrl.diagnostics.report.people import has_people, people_section
 from bayespbrl.diagnostics.report.summary import summary
 from bayespbrl.diagnostics.report.warnings import find_warnings
 from bayespbrl.features import StateFeatures
@@ -85,6 +86,7 @@ def assembled(contents: RunContents) -> Report:
         ("convergence", "Convergence of the posterior", lambda: sections.convergence_of_fits(contents, iterations)),
         ("utility", "Inferred utility", lambda: utility.utility(contents, ranking)),
         ("answers", "Answers, most surprising first", lambda: answers.answers(contents, answered)),
+        *([("people", "People", lambda: people_section(contents))] if has_people(contents) else []),
         ("calibration", "Calibration of the predictions", lambda: sections.calibration(contents, scores)),
         ("updates", "Policy updates", lambda: sections.updates(iterations)),
         ("sensitivity", "Sensitivity to σ and m", lambda: sections.sensitivity_to_model(contents)),

@@ -1,0 +1,69 @@
+"""Those who answered: how often each lapses, favours a side, contradicts themselves, and how long they take."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from bayespbrl.preferences import Answer, PastQuestion
+
+LEVEL = 0.9  # of all intervals
+
+
+def people(past: Sequence[PastQuestion], posterior: xr.DataTree | None = None) -> xr.Dataset:
+    """The figures of each answerer, along `answerer`, by name; "" is whoever gave no name.
+
+    Args:
+      past: the questions that were answered, `learner.state.past`.
+      posterior: fitted to these answers, `learner.estimate.posterior`; None: without lapse rates and side biases.
+
+    Returns:
+      `answers`, of which `ties`, and `cannot_tell`, which are no answers; `lapse_rate` and `side_bias`, posterior
+      means, with `…_lower` and `…_upper`, their 90 % intervals (the bias is positive towards the first shown, in
+      standard deviations of the margins; NaN where it is not inferred); `repeated`, how many of their answers were
+      asked for again from them and answered, and `consistent`, how many of these said the same, with
+      `consistency_lower` and `consistency_upper`, the exact 90 % interval of its share (Clopper and Pearson 1934);
+      `seconds`, the median response time, NaN where none is known.
+    """
+    names = list(dict.fromkeys(question.answerer or "" for question in past))
+    rows = [_figures(name, [q for q in past if (q.answerer or "") == name], posterior) for name in names]
+    columns = rows[0] if rows else _figures("", [], None)
+    data = {name: ("answerer", np.array([row[name] for row in rows])) for name in columns}
+    return xr.Dataset(data, coords={"answerer": np.array(names, dtype=object)})
+
+
+def _figures(name: str, past: Sequence[PastQuestion], posterior: xr.DataTree | None) -> dict[str, float]:
+    given = [question for question in past if question.answer is not Answer.SKIP]
+    earlier = {question.number: question for question in given}
+    again = [(earlier[q.repeats], q) for q in given if q.repeats in earlier]
+    consistent = sum(one.preferred == other.preferred for one, other in again)
+    times = [question.seconds for question in past if question.seconds is not None]
+    figures: dict[str, float] = {
+        "answers": len(given),
+        "ties": sum(question.answer is Answer.TIE for question in given),
+        "cannot_tell": len(past) - len(given),
+        "repeated": len(again),
+        "consistent": consistent,
+        "seconds": float(np.median(times)) if times else np.nan,
+    }
+    interval = stats.binomtest(consistent, len(again)).proportion_ci(LEVEL, method="exact") if again else (0.0, 1.0)
+    figures |= {"consistency_lower": float(interval[0]), "consistency_upper": float(interval[1])}
+    for quantity in ("lapse_rate", "side_bias"):
+        draws = _draws(name, quantity, posterior)
+        figures[quantity] = float(np.mean(draws))
+        figures[f"{quantity}_lower"], figures[f"{quantity}_upper"] = (
+            float(end) for end in np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        )
+    return figures
+
+
+def _draws(name: str, quantity: str, posterior: xr.DataTree | None) -> np.ndarray:
+    """Posterior draws of one answerer's lapse rate or side bias; NaN where there are none."""
+    drawn = None if posterior is None else posterior.children["posterior"].dataset
+    if drawn is None or quantity not in drawn:
+        return np.array([np.nan])
+    if "answerer" in drawn.coords:
+        known = name in drawn["answerer"].values
+        return drawn[quantity].sel(answerer=name).values.ravel() if known else np.array([np.nan])
+    return np.asarray(drawn[quantity].values).ravel()

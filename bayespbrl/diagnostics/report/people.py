@@ -1,0 +1,98 @@
+"""The section of a report on those who answered, and what to do about each."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import xarray as xr
+
+from bayespbrl.diagnostics.people import people
+from bayespbrl.diagnostics.report.contents import RunContents
+from bayespbrl.diagnostics.report.document import Body, ReportWarning, Table
+from bayespbrl.diagnostics.report.formatting import count, number, percent
+
+# A lapse rate that is surely above the first is worth less trust; above the second the answers are worth little.
+LESS_TRUST, LITTLE_WORTH = 0.1, 0.5
+RARELY_CONSISTENT = 0.8  # a share of repeated answers that is surely below
+HASTY, FEW, MANY = 1.0, 5, 0.3  # seconds; answers that say something about a person; share of questions
+
+
+def has_people(contents: RunContents) -> bool:
+    """Whether people answered: some answer has a name, or the expert is no simulation."""
+    named = any(question.answerer is not None for question in contents.past)
+    return bool(contents.past) and (named or contents.settings.expert != "return")
+
+
+def people_section(contents: RunContents) -> Body:
+    """The figures of each person, and a sentence on whoever needs one."""
+    table = _table(contents)
+    head = ["person", "answers", "ties", "cannot tell", "lapse rate", "side bias", "same on repeats", "median time"]
+    rows = [_row(table.isel(answerer=place)) for place in range(table.sizes["answerer"])]
+    caption = (
+        "Everyone who answered, with 90 % intervals. Lapse rate: the share of answers that are coin tosses. Side bias: "
+        "how much better the trajectory shown first looks, in standard deviations of the utility differences. Same on "
+        "repeats: how many repeated questions were answered as before, with the exact interval of the share."
+    )
+    text = [f"{warning.what} {warning.remedy}" for warning in people_warnings(contents)]
+    return text or ["Nothing about anyone's answers asks for action."], [Table(caption, head, rows)]
+
+
+def people_warnings(contents: RunContents) -> list[ReportWarning]:
+    """What to do about whom."""
+    table = _table(contents)
+    several = table.sizes["answerer"] > 1
+    return [
+        warning
+        for place in range(table.sizes["answerer"])
+        for warning in _of_one(table.isel(answerer=place), several=several)
+    ]
+
+
+def _table(contents: RunContents) -> xr.Dataset:
+    return people(contents.past, contents.posterior)
+
+
+def _row(one: xr.Dataset) -> list[str]:
+    repeated, consistent, seconds = (float(one[name]) for name in ("repeated", "consistent", "seconds"))
+    share = f"{consistent:.0f} of {repeated:.0f} ({_range(one, 'consistency')})" if repeated else "–"
+    inferred = [
+        "–" if np.isnan(float(one[name])) else f"{number(round(float(one[name]), 3))} ({_range(one, name)})"
+        for name in ("lapse_rate", "side_bias")
+    ]
+    counts = [str(int(one[name])) for name in ("answers", "ties", "cannot_tell")]
+    return [_name(one), *counts, *inferred, share, "–" if np.isnan(seconds) else f"{seconds:.1f} s"]
+
+
+def _range(one: xr.Dataset, name: str) -> str:
+    low, high = (number(round(float(one[f"{name}_{end}"]), 3)) for end in ("lower", "upper"))
+    return f"{low} to {high}"
+
+
+def _name(one: xr.Dataset) -> str:
+    return str(one["answerer"].item()) or "no name"
+
+
+def _of_one(one: xr.Dataset, *, several: bool) -> Iterator[ReportWarning]:
+    who = str(one["answerer"].item()) or "The person without a name"
+    others = f"run.estimate_without({who!r}) infers the utility without them."
+    rate, lower, upper = (float(one[f"lapse_rate{end}"]) for end in ("", "_lower", "_upper"))
+    if lower > LITTLE_WORTH:
+        what = f"{who}: {percent(rate)} of the answers look like coin tosses ({percent(lower)} to {percent(upper)})."
+        yield ReportWarning(what, f"Drop them. {others}" if several else "Ask someone else, and start anew.")
+    elif lower > LESS_TRUST:
+        what = f"{who}: {percent(rate)} of the answers look like coin tosses ({percent(lower)} to {percent(upper)})."
+        yield ReportWarning(what, "Trust them less: the posterior already does. Ask more questions to make up for it.")
+    repeated, consistent = int(one["repeated"]), int(one["consistent"])
+    if float(one["consistency_upper"]) < RARELY_CONSISTENT:
+        what = f"{who}: only {consistent} of {count(repeated, 'repeated question')} were answered as before."
+        yield ReportWarning(what, "Ask again, with clearer instructions or longer trajectories.")
+    bias, low, high = (float(one[f"side_bias{end}"]) for end in ("", "_lower", "_upper"))
+    if low > 0 or high < 0:
+        what = f"{who} favours the trajectory shown {'first' if bias > 0 else 'second'}."
+        yield ReportWarning(what, "The posterior corrects for it; ask them to look at both before they answer.")
+    unsure, given = int(one["cannot_tell"]), int(one["answers"])
+    if unsure > MANY * max(FEW, unsure + given):
+        what = f"{who} could not tell in {unsure} of {count(unsure + given, 'question')}."
+        yield ReportWarning(what, "Show longer trajectories, or explain what to look for.")
+    if float(one["seconds"]) < HASTY and given >= FEW:
+        what = f"{who} took {float(one['seconds']):.1f} s in the median, less than it takes to watch two trajectories."
+        yield ReportWarning(what, "Ask again, and ask them to watch both.")
