@@ -13,10 +13,15 @@ from toys import QUICK
 
 import bayespbrl
 
-FLAGS = (
-    "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync"
-).split()
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
 READY = ".bp-box[data-phase=question][data-locked=false]"
 KEYS = {"first": "ArrowLeft", "second": "ArrowRight", "tie": "ArrowDown"}
 CELLS = [
