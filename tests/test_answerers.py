@@ -216,7 +216,7 @@ def test_what_repeats_no_earlier_question_is_refused():
         apply(run.state, Entry(event | {"repeats": first.number}))
 
 
-# By hand: Ada repeats herself once and contradicts herself once; Bob ties, cannot tell, and is asked one of hers.
+# By hand: Ada is asked twice again and says the same once; Bob ties, cannot tell, and is asked a question of hers.
 PAST = (
     PastQuestion(1, 0, 1, 1, None, Answer.FIRST, "Ada", 2.0),
     PastQuestion(2, 2, 3, 3, None, Answer.SECOND, "Ada", 4.0),

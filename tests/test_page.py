@@ -21,8 +21,13 @@ from bayespbrl.people.page import LARGEST_BODY, Page
 from bayespbrl.people.session import Session
 
 FLAGS = [
-    "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking",
-    "--disable-component-update --disable-sync",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
 ]
 READY = ".bp-box[data-phase=question][data-locked=false]"
 KEYS = {"first": "ArrowLeft", "second": "ArrowRight", "tie": "ArrowDown", "skip": "s", "undo": "u"}
@@ -37,7 +42,7 @@ def browser():
     chromium = shutil.which("chromium")
     assert chromium, "no chromium on the PATH: install it, for example with `apt-get install chromium`"
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=" ".join(FLAGS).split())
+        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         yield started
         started.close()
 

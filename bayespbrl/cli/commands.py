@@ -250,11 +250,11 @@ def main() -> None:
 
 
 def _check_expert(name: str | None, answerer: str | None) -> None:
-    """Refuse an expert of the user's own, a name for a simulated one, and a page without what it needs."""
+    """Refuse an expert who cannot answer here, a name for a simulated one, and a page without its extra."""
     if answerer is not None:
         checks.short_name("answerer", answerer)
         if name not in ("terminal", "page"):
-            raise ValueError(f"answerer: expected a name with a person who answers (terminal, page), got {answerer!r}")
+            raise ValueError(f"answerer: expected a name with the expert page or terminal, got {answerer!r}")
     if name == "other":
         raise ValueError("expert: expected return, page or terminal, got other; continue in Python with Learner.run")
     if name == "page":

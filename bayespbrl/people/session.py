@@ -175,6 +175,7 @@ class Session:
             self._foresight.keep(moment, entry)
         if moment is self._foresight.present:
             self._settle()
+        self._changed.notify_all()
 
     def _failed(self, moment: Moment, error: Exception) -> None:
         moment.failed = True

@@ -27,20 +27,24 @@ class ComparisonWidget(anywidget.AnyWidget):
     view = traitlets.Dict().tag(sync=True)
     first = traitlets.Bytes().tag(sync=True)
     second = traitlets.Bytes().tag(sync=True)
+    _opened = False
     whole_page = traitlets.Bool(False).tag(sync=True)
 
     def __init__(self, learner: Learner, *, most_answers: int | None = None, answerer: str | None = None):
-        super().__init__()
         self.session = Session(learner, most_answers=most_answers, answerer=answerer)
+        super().__init__()
         self.view = dict(self.session.view)
         self.on_msg(self._hear)
         self._deaf = self.session.listen(self._update)
         self.session.open()
+        self._opened = True
 
     def close(self) -> None:
         """End the session and the widget; the learner can be used again."""
-        self._deaf()
-        self.session.close()
+        if self._opened:  # it is also called where a bad option was refused
+            self._deaf()
+            self.session.close()
+            self._opened = False
         super().close()
 
     def _update(self) -> None:

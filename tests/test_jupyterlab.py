@@ -1,0 +1,95 @@
+"""The widget in JupyterLab, in a browser: a scripted person answers a whole run, and cells stay free."""
+
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+from toys import QUICK
+
+import bayespbrl
+
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+READY = ".bp-box[data-phase=question][data-locked=false]"
+KEYS = {"first": "ArrowLeft", "second": "ArrowRight", "tie": "ArrowDown"}
+CELLS = [
+    f"import bayespbrl\nlearner = bayespbrl.start('gridworld', 'run', expert='other', **{QUICK!r})\nlearner.widget()",
+    "print('cells', 'stay', 'free')",
+]
+
+
+@pytest.fixture
+def lab(tmp_path):
+    """A JupyterLab server over a notebook of two cells: its address, and the folder."""
+    empty = {"cell_type": "code", "execution_count": None, "metadata": {}, "outputs": []}
+    kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+    cells = [empty | {"id": f"cell{number}", "source": source} for number, source in enumerate(CELLS)]
+    notebook = {"cells": cells, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
+    (tmp_path / "people.ipynb").write_text(json.dumps(notebook))
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    options = ["--no-browser", "--allow-root", "--ServerApp.token=t", f"--port={port}", "--ServerApp.port_retries=0"]
+    options += ["--expose-app-in-browser", "--LabApp.news_url=None", "--LabApp.check_for_updates_class="]
+    options[-1] += "jupyterlab.handlers.announcements.NeverCheckForUpdate"
+    command = [sys.executable, "-m", "jupyterlab", *options]
+    server = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        lines = iter(server.stdout.readline, "")
+        assert any("is running at" in line for line in lines)
+        yield f"http://127.0.0.1:{port}/lab/tree/people.ipynb?token=t", tmp_path
+        urllib.request.urlopen(urllib.request.Request(f"http://127.0.0.1:{port}/api/shutdown?token=t", method="POST"))
+        server.communicate(timeout=20)
+    finally:
+        server.kill()
+        server.communicate()
+
+
+@pytest.mark.slow
+def test_a_scripted_person_answers_a_whole_run_in_jupyterlab(lab):
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium")
+    assert chromium, "no chromium on the PATH: install it, for example with `apt-get install chromium`"
+    address, folder = lab
+    expert = bayespbrl.ReturnExpert()
+    plain = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        opened = browser.new_page(viewport={"width": 1100, "height": 1000})
+        opened.goto(address)
+        opened.click(".jp-CodeCell .cm-content", timeout=60_000)
+        opened.wait_for_selector(
+            "[data-status=idle], .jp-Notebook-ExecutionIndicator[data-status=idle]", timeout=60_000
+        )
+        opened.keyboard.press("Control+Enter")
+        opened.wait_for_selector(READY, timeout=60_000)
+        opened.click(".bp-ask")
+        while questions := plain.ask():
+            turn = opened.get_attribute(".bp-box", "data-turn")
+            answer = str(expert(*questions[0].trajectories))
+            opened.keyboard.press(KEYS[answer])
+            plain.tell([answer])
+            opened.wait_for_selector(f"{READY}:not([data-turn='{turn}']), .bp-box[data-phase=finished]")
+            if turn == "1":  # keys that JupyterLab would act on, and a cell while a question waits
+                for key in ("a", "b", "x", "z"):
+                    opened.keyboard.press(key)
+                opened.click(".jp-CodeCell >> nth=1 >> .cm-content")
+                opened.keyboard.press("Control+Enter")
+                opened.wait_for_selector("text=cells stay free")
+                opened.click(".bp-ask")
+        assert opened.locator(".jp-CodeCell").count() == len(CELLS)
+        assert re.search("4 answers", opened.inner_text(".bp-ask"))
+        browser.close()
+    assert bayespbrl.load(folder / "run").preferences == plain.preferences

@@ -1,0 +1,310 @@
+"""A sitting without a browser: turns, what is computed ahead, clips, the widget, and the command line around them."""
+
+import io
+import sys
+from unittest import mock
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+from PIL import Image
+from toys import QUICK, Slope, fingerprint
+
+import bayespbrl
+from bayespbrl.cli.commands import main
+from bayespbrl.people.clips import MOST_BYTES, Clips
+from bayespbrl.people.plots import observation_names
+from bayespbrl.people.session import FINISHED, QUESTION, Session, Stale, answer_of
+from bayespbrl.people.widget import ComparisonWidget
+from bayespbrl.runs.lock import continuing
+
+WAIT = 120  # seconds at most
+
+
+@pytest.fixture
+def sitting():
+    """Opens sessions, and closes them."""
+    opened = []
+
+    def sit(learner, **options):
+        opened.append(Session(learner, **options).open())
+        return opened[-1]
+
+    yield sit
+    for session in opened:
+        session.close()
+
+
+def answer_all(session, expert):
+    while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
+        session.answer(view["turn"], str(expert(*session.learner.state.query.trajectories)), 1.5)
+    assert view["phase"] == FINISHED
+    return view
+
+
+@pytest.mark.slow
+def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitting):
+    options = QUICK | {"utility": "posterior-mean", "expert": "other"}
+    session = sitting(bayespbrl.Learner("gridworld", **options), answerer="Ada")
+    ahead = []
+    while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
+        moment = session._foresight.present
+        with session._changed:  # until the thread has foreseen both likely answers
+            foreseen = session._changed.wait_for(
+                lambda now=moment: len(now.after) >= 2 and all(now.after[a].complete for a in now.likely[:2]), WAIT
+            )
+        assert foreseen
+        given = bayespbrl.ReturnExpert()(*session.learner.state.query.trajectories)
+        ahead.append(given in moment.after and moment.after[given].complete)
+        session.answer(view["turn"], str(given), 1.5)
+    plain = bayespbrl.Learner("gridworld", **options).run(bayespbrl.ReturnExpert(), answerer="Ada")
+    assert fingerprint(session.learner) == fingerprint(plain)
+    assert any(ahead)
+
+
+def test_nothing_reaches_the_log_before_the_answer(sitting, tmp_path):
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
+    session = sitting(learner)
+    session.wait(timeout=WAIT)
+    before = learner.log.log_file.read_bytes()
+    moment = session._foresight.present
+    with session._changed:
+        assert session._changed.wait_for(lambda: len(moment.after) > 1, WAIT)
+    assert learner.log.log_file.read_bytes() == before
+
+
+def test_a_turn_takes_one_answer_and_an_undo_is_a_turn_of_its_own(sitting):
+    session = sitting(bayespbrl.Learner("gridworld", expert="other", **QUICK))
+    first = session.wait(timeout=WAIT)
+    assert (first["turn"], first["answered"], first["undo"]) == (1, 0, False)
+    session.answer(1, "first", 2.0)
+    with pytest.raises(Stale, match="turn: expected 2, got 1"):
+        session.answer(1, "second")
+    second = session.wait(timeout=WAIT)
+    session.answer(2, "undo")
+    again = session.wait(timeout=WAIT)
+    assert (second["answered"], again["turn"], again["answered"]) == (1, 3, 0)
+    assert again["clips"] == first["clips"]
+    with pytest.raises(ValueError, match="expert: expected one of"):
+        session.answer(3, "left")
+    session.answer(3, "second")
+    view = answer_all(session, lambda first, second: "tie")
+    assert view["answered"] == 4
+    assert "3 iterations" in view["say"]
+
+
+def test_a_sitting_ends_after_its_answers_and_the_run_goes_on(sitting):
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    view = answer_all(sitting(learner, most_answers=2), lambda first, second: "tie")
+    assert view["answered"] == 2
+    assert "2 answers of this sitting" in view["say"]
+    assert learner.ask()
+
+
+def test_a_full_disk_ends_the_sitting_and_keeps_the_answers(sitting, tmp_path):
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
+    session = sitting(learner)
+    session.wait(timeout=WAIT)
+    append = learner.log.append
+
+    def full(entry, state):
+        if entry.event["event"] != "answered":
+            raise OSError("No space left on device")
+        append(entry, state)
+
+    with mock.patch.object(learner.log, "append", full):
+        session.answer(1, "first")
+        view = session.wait(("failed",), WAIT)
+    assert view["say"] == "Stopped: No space left on device Your answers are kept."
+    assert bayespbrl.load(tmp_path / "run").preferences.answers == 1
+
+
+@pytest.mark.parametrize(
+    "message",
+    [None, [], {"turn": True, "answer": "first"}, {"turn": 1}, {"turn": 1, "answer": "first", "seconds": True}],
+)
+def test_a_message_that_is_no_answer_is_refused(message):
+    with pytest.raises(ValueError, match="expected"):
+        answer_of(message)
+
+
+class Camera(gymnasium.Env):
+    """A point on a line that its own pictures show; `jumps` makes an episode differ from its repetition."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's interface)
+    observation_space = Box(-10.0, 10.0, (1,), dtype=np.float64)
+    action_space = Discrete(2, start=3)
+
+    def __init__(self, render_mode="rgb_array", jumps=False):
+        self.render_mode, self.jumps, self.episodes = render_mode, jumps, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.episodes += 1
+        self.position = self.np_random.normal(0, 0.1, 1) + self.jumps * self.episodes
+        return self.position.copy(), {}
+
+    def step(self, action):
+        self.position = self.position + (0.2 if action == 4 else -0.2) + self.np_random.normal(0, 0.01, 1)
+        return self.position.copy(), 0.0, False, False, {}
+
+    def render(self):
+        noise = np.random.default_rng(0).integers(0, 255, (60, 90, 3), dtype=np.uint8)
+        noise[:, int(np.clip(45 + 5 * self.position[0], 0, 89))] = 0
+        return noise
+
+
+class Many(Slope):
+    """Observations that nobody can draw, with names or without."""
+
+    observation_space = Box(-10.0, 10.0, (8,), dtype=np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return np.resize(observation, 8), info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return np.resize(observation, 8), *rest
+
+
+def clips_of(env, **options):
+    learner = bayespbrl.Learner(env, expert="other", **QUICK | options)
+    drawn = Clips(learner)
+    query = learner.ask()[0]
+    clips = drawn.of(query)
+    for clip, trajectory in zip(clips, query.trajectories, strict=True):
+        sheet = Image.open(io.BytesIO(clip.sheet))
+        assert sheet.size == (clip.columns * clip.width, -(-clip.frames // clip.columns) * clip.height)
+        assert (clip.steps, clip.ended) == (len(trajectory), trajectory.terminated)
+        assert len(clip.sheet) <= MOST_BYTES
+        sheet = sheet.convert("RGBA")
+        box = (0, 0, clip.width, clip.height)
+        assert sheet.crop(box).getextrema() != ((0, 0),) * 4  # something is drawn
+    longest = max(clip.steps for clip in clips)
+    assert longest / 8 <= drawn.rate(clips) <= longest / 2.5
+    return clips
+
+
+@pytest.mark.parametrize("env", ["gridworld", "swing-up", "bicycle", "acrobot", "CartPole-v1", "Pendulum-v1"])
+def test_shipped_tasks_and_classics_are_drawn_from_their_observations(env):
+    clips = clips_of(env)
+    assert {clip.width for clip in clips} == {320}
+    assert all(clip.frames == clip.steps + 1 for clip in clips)
+
+
+def test_an_environment_that_renders_is_filmed_by_itself():
+    clips = clips_of(Camera())
+    assert {(clip.width, clip.height, clip.frames) for clip in clips} == {(90, 60, 21)}
+    assert all(clip.sheet.startswith(b"\xff\xd8") for clip in clips)  # JPEG: many colours
+
+
+@pytest.mark.parametrize("env", [Camera(jumps=True), Camera(render_mode=None), Slope(), Many()])
+def test_where_an_episode_cannot_be_filmed_its_observations_are_plotted(env):
+    clips = clips_of(env)
+    assert {(clip.width, clip.height) for clip in clips} == {(440, 400)}
+
+
+def test_a_plot_names_the_observations_as_the_environment_does():
+    env = Slope()
+    assert observation_names(env, 2) == ["observation 0", "observation 1"]
+    env.observation_names = ("position", "speed")
+    assert observation_names(env, 2) == ["position", "speed"]
+    env.observation_names = ("position",)
+    assert observation_names(env, 2) == ["observation 0", "observation 1"]
+
+
+def test_a_clip_of_many_large_pictures_is_made_to_fit():
+    class Large(Camera):
+        def render(self):
+            return np.random.default_rng(0).integers(0, 255, (500, 900, 3), dtype=np.uint8)
+
+    clips = clips_of(Large(), max_steps=60)
+    assert {clip.width for clip in clips} == {480}
+    assert all(clip.frames < 61 for clip in clips)
+
+
+def test_the_widget_asks_and_tells_by_its_messages():
+    expert = bayespbrl.ReturnExpert()
+    widget = bayespbrl.Learner("gridworld", expert="other", **QUICK).widget(answerer="Ada")
+    assert isinstance(widget, ComparisonWidget)
+    try:
+        session = widget.session
+        sent = []
+        with mock.patch.object(widget, "send", sent.append):
+            while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
+                given = str(expert(*session.learner.state.query.trajectories))
+                message = {"turn": view["turn"], "answer": given, "seconds": 1.0}
+                widget._handle_custom_msg(message, [])
+                widget._handle_custom_msg(message, [])  # a second click
+        assert widget.view["phase"] == FINISHED
+        assert [message["refused"] for message in sent] == [1, 2, 3, 4]
+        assert widget.first.startswith(b"\x89PNG")
+    finally:
+        widget.close()
+    plain = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(expert, answerer="Ada")
+    assert fingerprint(session.learner) == fingerprint(plain)
+
+
+@pytest.mark.parametrize("options", [{"answers": 0}, {"answerer": ""}])
+def test_the_widget_refuses_bad_options(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        bayespbrl.Learner("gridworld", expert="other", **QUICK).widget(**options)
+
+
+def refused(monkeypatch, capsys, *arguments):
+    """The one line with which the command line refuses these arguments."""
+    monkeypatch.setattr(sys, "argv", ["bayespbrl", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    error = capsys.readouterr().err
+    assert (stop.value.code, error.count("\n")) == (2, 1)
+    return error
+
+
+@pytest.fixture
+def directory(tmp_path):
+    """A run that waits for a person, and its size."""
+    bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK).ask()
+    return tmp_path / "run"
+
+
+def test_a_run_that_is_continued_elsewhere_is_refused(monkeypatch, capsys, directory):
+    with continuing(directory):
+        for command in ("ask", "resume"):
+            assert "continued elsewhere" in refused(monkeypatch, capsys, command, directory)
+    with continuing(directory):
+        pass
+
+
+def test_a_run_that_nobody_can_be_asked_about_is_refused(monkeypatch, capsys, directory, tmp_path):
+    assert "settings.json" in refused(monkeypatch, capsys, "ask", tmp_path)
+    bayespbrl.resume(directory).run(lambda first, second: "tie")
+    assert "this run is finished" in refused(monkeypatch, capsys, "ask", directory)
+    bayespbrl.start("gridworld", tmp_path / "simulated", **QUICK)
+    assert "expected a run that a person answers" in refused(monkeypatch, capsys, "ask", tmp_path / "simulated")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [(["--answers", "0"], "answers"), (["--answerer", " "], "answerer"), (["--port", "-1"], "port")],
+)
+def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options, named):
+    before = (directory / "events.jsonl").read_bytes()
+    assert named in refused(monkeypatch, capsys, "ask", directory, *options)
+    assert (directory / "events.jsonl").read_bytes() == before
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys, directory, tmp_path):
+    for module in ("bayespbrl.people.page", "bayespbrl.people.widget"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.delattr("bayespbrl.people.page", raising=False)
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    monkeypatch.setitem(sys.modules, "anywidget", None)
+    assert "pip install 'bayespbrl[people]'" in refused(monkeypatch, capsys, "ask", directory)
+    new = tmp_path / "new"
+    assert "pip install" in refused(monkeypatch, capsys, "run", "gridworld", "--expert", "page", "--out", new)
+    assert not new.exists()
+    with pytest.raises(ValueError, match="the widget needs the extra people"):
+        bayespbrl.resume(directory).widget()
