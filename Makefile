@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # plugins only xdist is loaded: importing the others takes each process seconds.
 PYTEST := PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -p xdist -q -n auto --maxprocesses 8 --dist worksteal
 
-.PHONY: run test check fast
+.PHONY: run test check fast results results-check
 .DEFAULT_GOAL := run
 
 $(VENV)/.installed: pyproject.toml
@@ -28,3 +28,9 @@ check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+results: $(VENV)/.installed
+	$(BIN)/python benchmarks/results_page.py
+
+results-check: $(VENV)/.installed
+	$(BIN)/python benchmarks/results_page.py --check

@@ -147,3 +147,29 @@ def test_the_index_of_the_results_names_every_file_once_and_nothing_else():
     results = BENCHMARKS / "results"
     named = re.findall(r"^\| \[([^\]]+)\]\(\1\) \|", (results / "README.md").read_text(), flags=re.MULTILINE)
     assert sorted(named) == sorted(path.name for path in results.iterdir() if path.name != "README.md")
+
+
+def test_results_follow_from_the_committed_data_and_a_changed_figure_is_found(tmp_path):
+    page = benchmark("results_page")
+    studies = page.committed()
+    text = page.page(studies)
+    assert text == page.PAGE.read_text()
+    changed = tmp_path / "RESULTS.md"
+    assert "-955" not in text
+    changed.write_text(re.sub(r"\| -95\d(\.\d)? \|", "| -9555 |", text, count=1))
+    page.differences_of_a_cell = lambda data: []  # run again in the test below
+    assert page.check(studies) == []
+    assert any("-9555" in line for line in page.check(studies, changed))
+    for folder in (BENCHMARKS / "studies").iterdir():
+        assert f"](benchmarks/studies/{folder.name}/" in text
+
+
+@pytest.mark.slow
+def test_a_cell_is_reproduced_and_another_value_is_found():
+    page = benchmark("results_page")
+    data = page.committed()["smoke"]
+    assert page.differences_of_a_cell(data) == []
+    row = page.cheapest(data)
+    row.lines["value"] += 1.0
+    (first, *_) = page.differences_of_a_cell(data)
+    assert re.match(r"study smoke, gridworld/\S+, seed \d+, iteration 1: expected value ", first)

@@ -1,0 +1,159 @@
+"""RESULTS.md from the committed data: written, or compared with what the data give.
+
+    python benchmarks/results_page.py            # writes RESULTS.md and the studies' figures
+    python benchmarks/results_page.py --check    # compares its text, and runs one cell of each study again
+
+The text is `benchmarks/RESULTS.md.jinja`; the tables are of the studies in `benchmarks/studies` (the four data files of
+each, as `bayespbrl study` and `bayespbrl results` leave them) and of the earlier ones in `benchmarks/results`.
+"""
+
+import argparse
+import difflib
+import re
+import sys
+import tempfile
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import jinja2
+import numpy as np
+import pandas as pd
+
+from bayespbrl.results.figures import curves_figure, profiles_figure
+from bayespbrl.results.intervals import failed_trials, median_interval
+from bayespbrl.results.study_data import RowData, StudyData, read_study
+from bayespbrl.results.tables import markdown
+from bayespbrl.results.write import section, tables_of
+from bayespbrl.runs.directory import read_summary
+from bayespbrl.studies.declaration import declared
+from bayespbrl.studies.rows import row_of, run_trial
+
+HERE = Path(__file__).parent
+PAGE = HERE.parent / "RESULTS.md"
+STUDIES, EARLIER = HERE / "studies", HERE / "results"
+# A trial that ends below has failed, in the earlier studies.
+EARLIER_FAILED = {"swing-up": -1300.0, "gridworld": 0.99 * 294.8125}
+TOLERANCE = 1e-5  # relative: the data have six digits
+
+
+def committed() -> dict[str, StudyData]:
+    """The studies with data, by name."""
+    return {path.parent.name: read_study(path.parent) for path in sorted(STUDIES.glob("*/study.json"))}
+
+
+def page(studies: dict[str, StudyData]) -> str:
+    """The text of RESULTS.md."""
+
+    def tables(name: str, *kinds: str) -> str:
+        if name not in studies:
+            title = declared(name).title
+            return f"**Not run yet.** `bayespbrl study {name}`: {title}. `--dry-run` says how long it takes."
+        found = tables_of(studies[name])
+        return "\n\n".join(section(studies[name], kind, found[kind]) for kind in kinds if kind in found)
+
+    def figures(name: str) -> str:
+        made = [kind for kind, make in FIGURES.items() if name in studies and make(studies[name]) is not None]
+        return "\n".join(f"![{kind} of the study {name}](benchmarks/studies/{name}/{kind}.png)" for kind in made)
+
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
+    template = environment.from_string((HERE / "RESULTS.md.jinja").read_text())
+    return template.render(tables=tables, figures=figures, earlier=earlier)
+
+
+FIGURES = {"curves": curves_figure, "profiles": profiles_figure}
+
+
+def earlier(task: str) -> str:
+    """The earlier studies of a task, from their files: options, and the value at the end."""
+    index = (EARLIER / "README.md").read_text()
+    named = re.findall(rf"^\| \[({re.escape(task)}[^\]]*\.csv)\]\([^)]*\) \| (.*?) \|$", index, flags=re.MULTILINE)
+    lines = []
+    for file, options in named:
+        trials = pd.read_csv(EARLIER / file).sort_values(["seed", "iteration"]).groupby("seed").last()
+        values = trials["value"].to_numpy()
+        middle, low, high = median_interval(values)
+        line = {
+            "file": f"[{file.removesuffix('.csv')}](benchmarks/results/{file})",
+            "options": options,
+            "trials": str(len(values)),
+            "answers": f"{trials['answers'].median():g}",
+            "median": f"{middle:.4g}",
+            "interval of the median": f"[{low:.4g}, {high:.4g}]",
+            "quartiles": " … ".join(f"{value:.4g}" for value in np.quantile(values, [0.25, 0.75])),
+        }
+        if task in EARLIER_FAILED:
+            failed = int((values < EARLIER_FAILED[task]).sum())
+            bounds = failed_trials(failed, len(values))
+            line["failed"] = f"{failed} of {len(values)} [{bounds.low:.2f}, {bounds.high:.2f}]"
+        lines.append(line)
+    return markdown(pd.DataFrame(lines))
+
+
+def write_figures(studies: dict[str, StudyData]) -> None:
+    """The figures of each study, beside its data."""
+    for name, data in studies.items():
+        for kind, make in FIGURES.items():
+            if (figure := make(data)) is not None:
+                figure.savefig(STUDIES / name / f"{kind}.png", dpi=90)
+
+
+def cheapest(data: StudyData) -> RowData | None:
+    """The row whose trials take the least time; None without one that learns."""
+    learned = [row for row in data.rows if not row.declared.untrained]
+    return min(learned, key=lambda row: float(row.lines["seconds"].sum() / len(row.seeds)), default=None)
+
+
+def differences_of_a_cell(data: StudyData) -> list[str]:
+    """What differs where the first trial of the cheapest row is run again; empty where nothing does.
+
+    A study of another version is not run again: it would differ.
+    """
+    row = cheapest(data)
+    if row is None or data.description.get("version") != version("bayespbrl"):
+        return []
+    seed = row.seeds[0]
+    kept = row.lines[row.lines["seed"] == seed]
+    with tempfile.TemporaryDirectory() as folder:
+        cell = row_of(row.declared.env, Path(folder) / "row", row.declared.options, seed=seed)
+        run_trial(cell, seed)
+        again = read_summary(cell.path(seed))["iterations"]
+    where = f"study {data.name}, {row.declared.name}, seed {seed}"
+    if len(again) != len(kept):
+        return [f"{where}: expected {len(kept)} iterations, got {len(again)}"]
+    names = ("answers", "value", "value_newest", "kl")
+    return [
+        f"{where}, iteration {entry['iteration']}: expected {name} {expected}, got {entry[name]}"
+        for entry, (_, line) in zip(again, kept.iterrows(), strict=True)
+        for name in names
+        if not np.isclose(expected := float(line[name]), float(entry[name]), rtol=TOLERANCE, atol=1e-9)
+    ]
+
+
+def check(studies: dict[str, StudyData], page_file: Path = PAGE) -> list[str]:
+    """What differs between RESULTS.md, the data and the software."""
+    kept = page_file.read_text().splitlines()
+    found = list(
+        difflib.unified_diff(kept, page(studies).splitlines(), "RESULTS.md", "from the data", lineterm="", n=0)
+    )
+    for data in studies.values():
+        found += differences_of_a_cell(data)
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write or check the page; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="compare only")
+    studies = committed()
+    if not parser.parse_args(arguments).check:
+        write_figures(studies)
+        PAGE.write_text(page(studies))
+        return 0
+    found = check(studies)
+    print("\n".join(found) if found else f"RESULTS.md follows from the data; {len(studies)} studies checked.")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
