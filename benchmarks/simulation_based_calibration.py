@@ -1,23 +1,27 @@
 """Simulation-based calibration of the posterior in the loop that it is used in: adaptive questions, adaptive stopping.
 
-    python benchmarks/simulation_based_calibration.py --runs 300 --jobs 2 [--ties] [--bug NAME] [--out FILE.csv]
+    python benchmarks/simulation_based_calibration.py --runs 300 [--ties] [--bug NAME] [--jobs 2] [--out FILE.csv]
 
 In each run everything is drawn from the prior of the model: setting of the features, weights, steepness, lapse rate,
 and with `--ties` the tie threshold. An answerer simulated by them answers questions about pairs of items that the
 posterior of the answers so far chooses, those of highest expected information, until that is below a limit or there are
 ten answers. The rank of each true value among the draws of the last posterior must then be uniform (Talts et al. 2018),
 whatever was asked and whenever it ended. Eq. 8 is given its K beforehand, because the probability of an answer depends
-on it.
+on it. One functional, the log likelihood of all answers, depends on the answers themselves: without it a posterior that
+ignores answers would pass (Modrák et al. 2023).
 
 Printed are, for each functional, the p-value of uniformity (χ², ten bins) and the smallest times their number
-(Bonferroni). `--bug` plants one that must be rejected: `no-setting` (the setting is never moved), `no-volume` (its move
-forgets the volume), `no-lapses` (the lapse rate is taken for zero), `one-steepness` (steepness is given, wrongly),
-`narrow` (the weights outside the answers' span are half as wide).
+(Bonferroni). With `--out` each run is a row of the file, written as it ends; a second call runs the missing seeds only.
+
+`--bug` plants one that must be rejected: `no-setting` (the setting is never moved), `no-volume` (its move forgets the
+volume), `no-lapses` (the lapse rate is taken for zero), `one-steepness` (steepness is given, wrongly), `narrow` (the
+weights outside the answers' span are half as wide), `prior-scale` (the prior's scale is taken for twice what it is),
+`half` (only the first half of the answers is used), `unmoved` (the chains stay where they start).
 """
 
 import argparse
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
 from multiprocessing import get_context
@@ -29,15 +33,21 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from bayespbrl.models import Answers, PreferenceModel, gibbs, low_rank, posterior_draws
-from bayespbrl.models.likelihoods import likelihood_of, prob
+from bayespbrl.models import Answers, EllipticalSlice, PreferenceModel, chains, gibbs, low_rank, posterior_draws
+from bayespbrl.models.likelihoods import Likelihood, likelihood_of, prob
 from bayespbrl.models.posterior import SamplerOptions
 from bayespbrl.queries import expected_information
 
 ITEMS, DIMENSION, SETTINGS, MOST_ANSWERS, LEAST_INFORMATION, KEPT = 12, 8, 3, 10, 0.05, 99
 MODEL = PreferenceModel(steepness=None, lapse_rate=None)
 SAMPLER = SamplerOptions(num_samples=100, max_samples=100)
-BUGS = ("no-setting", "no-volume", "no-lapses", "one-steepness", "narrow")
+ASKING = SamplerOptions(num_samples=25, max_samples=25, num_chains=2)  # which questions are asked need not be exact
+WRONG_MODELS = {
+    "no-lapses": PreferenceModel(steepness=None, lapse_rate=0.0),
+    "one-steepness": PreferenceModel(steepness=0.5, lapse_rate=None),
+    "prior-scale": PreferenceModel(2.0, steepness=None, lapse_rate=None),
+}
+BUGS = ("no-setting", "no-volume", "no-lapses", "one-steepness", "narrow", "prior-scale", "half", "unmoved")
 Ranks = dict[str, float]
 
 
@@ -50,37 +60,72 @@ def one_run(seed: int, bug: str = "", *, ties: bool = False) -> Ranks:
     truth["threshold"] *= ties
     utilities = features[truth["setting"]] @ truth["weights"]
     pairs, tied = np.zeros((0, 2), int), np.zeros(0, bool)
-    model = {
-        "no-lapses": PreferenceModel(steepness=None, lapse_rate=0.0),
-        "one-steepness": PreferenceModel(steepness=0.5, lapse_rate=None),
-    }.get(bug, MODEL)
-    while True:
-        rows = features[:, pairs[:, 0]] - features[:, pairs[:, 1]]
-        tree = posterior_draws(
-            rows,
-            model,
-            seed=seed,
-            answers=Answers(tied if ties else None),
-            number_of_preferences=MOST_ANSWERS,
-            sampler=SAMPLER,
-        )
-        drawn = tree["posterior"].dataset.isel(draw=slice(None, None, 2))
+    while len(pairs) < MOST_ANSWERS:
+        drawn = _posterior(features, pairs, tied if ties else None, WRONG_MODELS.get(bug, MODEL), ASKING, seed)
         asked = _pairs(rng, 8)
-        settings, weights = drawn["setting"].values.ravel(), drawn["utility_weights"].values.reshape(-1, DIMENSION)
-        margins = np.einsum("spd,sd->sp", (features[:, asked[:, 0]] - features[:, asked[:, 1]])[settings], weights)
-        values = {name: drawn[name].values.reshape(len(settings), 1) for name in ("steepness", "lapse_rate")}
-        likelihood = likelihood_of("mixed", float(MOST_ANSWERS), **values)
-        information = expected_information(margins, np.zeros(len(margins)), likelihood=likelihood)
+        margins = _margins(features[:, asked[:, 0]] - features[:, asked[:, 1]], drawn)
+        information = expected_information(margins, np.zeros(len(margins)), likelihood=_likelihood(drawn))
         best = int(np.argmax(information))
-        if len(pairs) == MOST_ANSWERS or (len(pairs) > 3 and information[best] < LEAST_INFORMATION):
+        if len(pairs) > 3 and information[best] < LEAST_INFORMATION:
             break
         first, second = asked[best]
         answer = _answer(rng, float(utilities[first] - utilities[second]), truth)
         pairs = np.concatenate([pairs, [[first, second] if answer >= 0 else [second, first]]])
         tied = np.append(tied, answer == 0)
+    kept = len(pairs) // 2 if bug == "half" else len(pairs)
+    told = tied[:kept] if ties else None
+    drawn = _posterior(features, pairs[:kept], told, WRONG_MODELS.get(bug, MODEL), SAMPLER, seed)
+    drawn = drawn.isel(draw=slice(None, None, 2))
     compared = _compared(features, drawn, truth)
-    chosen = rng.choice(len(settings), KEPT, replace=False)
+    compared["log likelihood"] = _log_likelihood(features, pairs, tied, drawn, truth)
+    chosen = rng.choice(drawn["setting"].size, KEPT, replace=False)
     return {name: _rank(rng, sample[chosen], true) for name, (sample, true) in compared.items()}
+
+
+def _posterior(
+    features: np.ndarray,
+    pairs: np.ndarray,
+    tied: np.ndarray | None,
+    model: PreferenceModel,
+    sampler: SamplerOptions,
+    seed: int,
+) -> xr.Dataset:
+    """Draws given the answers so far."""
+    rows = features[:, pairs[:, 0]] - features[:, pairs[:, 1]]
+    tree = posterior_draws(
+        rows, model, seed=seed, answers=Answers(tied), number_of_preferences=MOST_ANSWERS, sampler=sampler
+    )
+    return tree["posterior"].dataset
+
+
+def _margins(differences: np.ndarray, drawn: xr.Dataset) -> np.ndarray:
+    """Of n differences under each setting, (C, n, D), in each draw, (S, n)."""
+    settings, weights = drawn["setting"].values.ravel(), drawn["utility_weights"].values.reshape(-1, DIMENSION)
+    return np.einsum("spd,sd->sp", differences[settings], weights)
+
+
+def _likelihood(drawn: xr.Dataset) -> Likelihood:
+    """Of an answer that states an order, under each draw."""
+    values = {name: drawn[name].values.reshape(-1, 1) for name in ("steepness", "lapse_rate")}
+    return likelihood_of("mixed", float(MOST_ANSWERS), **values)
+
+
+def _log_likelihood(
+    features: np.ndarray, pairs: np.ndarray, tied: np.ndarray, drawn: xr.Dataset, truth: dict[str, Any]
+) -> tuple[np.ndarray, float]:
+    """Of all answers, in each draw and in truth."""
+    differences = features[:, pairs[:, 0]] - features[:, pairs[:, 1]]
+    margins, true_margins = _margins(differences, drawn), differences[truth["setting"]] @ truth["weights"]
+    true = likelihood_of("mixed", float(MOST_ANSWERS), steepness=truth["steepness"], lapse_rate=truth["lapse"])
+    threshold = drawn["tie_threshold"].values.reshape(-1, 1) if "tie_threshold" in drawn else 0.0
+    return _of_answers(_likelihood(drawn), margins, threshold, tied), float(
+        _of_answers(true, true_margins, truth["threshold"], tied)
+    )
+
+
+def _of_answers(likelihood: Likelihood, margins: np.ndarray, threshold: Any, tied: np.ndarray) -> np.ndarray:
+    above, below = prob(likelihood, margins - threshold), prob(likelihood, -margins - threshold)
+    return np.asarray(np.sum(np.log(np.maximum(np.where(tied, 1 - above - below, above), 1e-300)), axis=-1))
 
 
 def _features(rng: np.random.Generator) -> np.ndarray:
@@ -95,11 +140,9 @@ def _features(rng: np.random.Generator) -> np.ndarray:
 def _compared(features: np.ndarray, drawn: xr.Dataset, truth: dict[str, Any]) -> dict[str, tuple[np.ndarray, float]]:
     """Draws of each functional, shape (S,), and its true value."""
     settings, weights = drawn["setting"].values.ravel(), drawn["utility_weights"].values.reshape(-1, DIMENSION)
-    values = {name: drawn[name].values.reshape(len(settings), 1) for name in ("steepness", "lapse_rate")}
-    likelihood = likelihood_of("mixed", float(MOST_ANSWERS), **values)
     held_out = features[:, 0] - features[:, 1]
-    margin = np.einsum("sd,sd->s", held_out[settings], weights)
-    probability = prob(likelihood, margin[:, None])[:, 0]
+    margin = _margins(held_out[:, None], drawn)[:, 0]
+    probability = prob(_likelihood(drawn), margin[:, None])[:, 0]
     true_margin = float(held_out[truth["setting"]] @ truth["weights"])
     true_likelihood = likelihood_of(
         "mixed", float(MOST_ANSWERS), steepness=truth["steepness"], lapse_rate=truth["lapse"]
@@ -107,12 +150,12 @@ def _compared(features: np.ndarray, drawn: xr.Dataset, truth: dict[str, Any]) ->
     compared = {
         "margin": (margin, true_margin),
         "probability": (probability, float(prob(true_likelihood, np.array([true_margin]))[0])),
-        "utility of the first": (
+        "return of the first": (
             np.einsum("sd,sd->s", features[:, 0][settings], weights),
             float((features[truth["setting"]] @ truth["weights"])[0]),
         ),
-        "lapse rate": (values["lapse_rate"][:, 0], truth["lapse"]),
-        "steepness": (values["steepness"][:, 0], truth["steepness"]),
+        "lapse rate": (drawn["lapse_rate"].values.ravel(), truth["lapse"]),
+        "steepness": (drawn["steepness"].values.ravel(), truth["steepness"]),
         "setting": ((settings == 2).astype(float), float(truth["setting"] == 2)),
     }
     if "tie_threshold" in drawn:
@@ -170,14 +213,30 @@ def _plant(bug: str) -> None:
             original(self, *arguments, prior_scale=prior_scale / 2, seed=seed)
 
         setattr(low_rank.UtilityWeights, "__init__", narrower)  # noqa: B010
+    elif bug == "unmoved":
+        setattr(chains, "moved", lambda key, z, unknowns, problem: (z, unknowns))  # noqa: B010
+        setattr(EllipticalSlice, "sample", lambda self, state, *_: state)  # noqa: B010
 
 
-def _all_ranks(runs: int, jobs: int, seed: int, bug: str, ties: bool) -> Iterator[Ranks]:
+def _all_ranks(seeds: Sequence[int], jobs: int, bug: str, ties: bool) -> Iterator[tuple[int, Ranks]]:
+    if jobs == 1:
+        yield from ((seed, one_run(seed, bug, ties=ties)) for seed in seeds)
+        return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as executor:
-        yield from executor.map(partial(one_run, bug=bug, ties=ties), range(seed, seed + runs))
+        yield from zip(seeds, executor.map(partial(one_run, bug=bug, ties=ties), seeds), strict=True)
+
+
+def kept_ranks(path: Path | None) -> dict[int, Ranks]:
+    """The rows of a file of ranks, by seed; none where there is no file."""
+    if path is None or not path.exists():
+        return {}
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {int(row.pop("seed")): {name: float(rank) for name, rank in row.items()} for row in rows}
 
 
 def main() -> None:
+    """Run what is missing, then print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--runs", type=int, default=300)
     parser.add_argument("--jobs", type=int, default=1)
@@ -186,19 +245,29 @@ def main() -> None:
     parser.add_argument("--ties", action="store_true")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    found: dict[str, list[float]] = {}
-    for ranks in _all_ranks(arguments.runs, arguments.jobs, arguments.seed, arguments.bug, arguments.ties):
-        for name, rank in ranks.items():
-            found.setdefault(name, []).append(rank)
+    seeds = range(arguments.seed, arguments.seed + arguments.runs)
+    known = {seed: ranks for seed, ranks in kept_ranks(arguments.out).items() if seed in seeds}
+    missing = [seed for seed in seeds if seed not in known]
+    for seed, ranks in _all_ranks(missing, arguments.jobs, arguments.bug, arguments.ties):
+        known[seed] = ranks
+        if arguments.out:
+            with arguments.out.open("a", newline="") as file:
+                writer = csv.writer(file)
+                if not file.tell():
+                    writer.writerow(["seed", *ranks])
+                writer.writerow([seed, *(f"{rank:.5f}" for rank in ranks.values())])
+    report([known[seed] for seed in seeds])
+
+
+def report(rows: Sequence[Ranks]) -> None:
+    """Print uniformity of each functional."""
+    found = {name: [ranks[name] for ranks in rows] for name in rows[0]}
     p_values = {}
     for name, values in found.items():
         counts, _ = np.histogram(values, bins=10, range=(0, 1))
         p_values[name] = float(stats.chisquare(counts).pvalue)
         print(f"{name:22} n = {len(values):4}  p = {p_values[name]:.3g}  {counts.tolist()}", flush=True)
     print(f"smallest p × {len(p_values)} = {min(1.0, min(p_values.values()) * len(p_values)):.3g}")
-    if arguments.out:
-        with arguments.out.open("w", newline="") as file:
-            csv.writer(file).writerows([[name, *values] for name, values in found.items()])
 
 
 if __name__ == "__main__":

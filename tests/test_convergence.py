@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from arviz_stats.base import array_stats
 
 from bayespbrl.models.convergence import chain_convergence
 
@@ -44,3 +45,18 @@ def test_nothing_to_estimate_has_converged():
 def test_too_few_draws_are_named():
     with pytest.raises(ValueError, match="draws: expected shape"):
         chain_convergence(np.zeros(5))
+
+
+def test_the_numbers_are_those_of_arviz():
+    rng, number = np.random.default_rng(3), 24
+    for chains, length in ((4, 250), (2, 25), (3, 7)):
+        draws, keep = np.zeros((chains, length, number)), rng.uniform(-0.9, 0.99, number)
+        for step in range(1, length):
+            draws[:, step] = keep * draws[:, step - 1] + rng.standard_normal((chains, number))
+        draws[..., -4:] = np.round(draws[..., -4:])  # ties
+        report, axes = chain_convergence(draws), {"chain_axis": 0, "draw_axis": 1}
+        np.testing.assert_allclose(report.rhat, array_stats.rhat(draws, **axes), rtol=1e-10)
+        bulk = array_stats.ess(draws, method="bulk", **axes)
+        np.testing.assert_allclose(report.effective_sample_size, bulk, rtol=1e-10)
+        error = array_stats.mcse(draws, method="mean", **axes)
+        np.testing.assert_allclose(report.monte_carlo_error, error, rtol=1e-10)
