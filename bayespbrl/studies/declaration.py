@@ -2,7 +2,7 @@
 
 title = "What is compared, as a noun phrase"
 trials = 20                      # of each row, one a seed
-seed = 4000                      # of the first trial
+seed = 6000                      # of the first trial
 
 [options]                        # of every row, as on the command line of `bayespbrl trials`
 preset = "paper"
