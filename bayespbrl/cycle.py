@@ -12,7 +12,7 @@ import gymnasium
 import jax
 import numpy as np
 
-from bayespbrl import events, queries, rollouts
+from bayespbrl import events, queries, questions, rollouts
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
@@ -67,7 +67,7 @@ class Cycle:
 
     def collect(self, state: LearnerState) -> Entry:
         """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
-        options, questions = self.settings.rollouts, self.settings.questions
+        options, asking = self.settings.rollouts, self.settings.questions
         began = time.perf_counter()
         collected = rollouts.rollout(
             self.environment,
@@ -76,9 +76,9 @@ class Cycle:
             episodes=options.trajectories_per_iteration,
             max_steps=options.max_steps,
             hold=options.exploration_hold,
-            starts=self._starts(state.iteration) if questions.same_start else None,
+            starts=self._starts(state.iteration) if asking.same_start else None,
         )
-        clips = questions.clips(collected, rng=self._rng(CLIPS, state.iteration))
+        clips = asking.clips(collected, rng=self._rng(CLIPS, state.iteration))
         known = (*state.compared, *clips_of(collected, clips))
         chosen = self._chosen_questions(state, known)
         event = {
@@ -90,18 +90,18 @@ class Cycle:
         }
         return _entry(event, trajectories=collected)
 
-    def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> queries.Chosen:
+    def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> questions.Chosen:
         options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)
         new, best = range(len(state.trajectories), len(known)), self._of_iteration(state.best)
         opponents = opponents_from_the_same_start(known, state.preferences, best) if options.same_start else {}
         if state.estimate is None:
-            return queries.first_questions(new, opponents, options, rng=rng)
+            return questions.first_questions(new, opponents, options, rng=rng)
         signal = None if state.bound is None else state.bound.signal
         if options.skips(state.preferences, state.unasked, state.estimate, signal):
-            return queries.Chosen()
+            return questions.Chosen()
         incumbent = state.preferences.undominated[-1]
         situation = QuerySituation(new, known, state.shown, incumbent, state.estimate, signal, rng, opponents)
-        return queries.later_questions(self.query_rule, situation, options, answers=state.preferences.answers)
+        return questions.later_questions(self.query_rule, situation, options, answers=state.preferences.answers)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""
@@ -125,7 +125,7 @@ class Cycle:
         """Step 4: the next question, the best candidate against its opponent, or a repeated one; `asked`."""
         number, newcomer, options = state.queries + 1, state.candidates[0], self.settings.questions
         left = options.left(state.preferences.answers + state.wanted)
-        again = queries.repeated(state.past, number, options, left=left, rng=self._rng(REPEAT, number))
+        again = questions.repeated(state.past, number, options, left=left, rng=self._rng(REPEAT, number))
         if again is not None:
             shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
             return _entry({"event": "asked", "query": number, **shown, "repeats": again.number})

@@ -7,7 +7,6 @@ Three lines make one of your own, for `Learner(query=...)`:
         return sorted(situation.new, reverse=True)
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,91 +16,13 @@ from scipy.special import entr
 
 from bayespbrl import checks
 from bayespbrl.models.likelihoods import Likelihood, prob
-from bayespbrl.preferences import Answer, PastQuestion, Preferences, Query
+from bayespbrl.preferences import Query
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
 
 # Posterior draws that a rule looks at: enough to order ten candidates, in hundredths of a second.
 QUERY_DRAWS = 500
 MOST_OLDER = 20  # their draws would soon cost more than all else
-UNASKED_SIGNAL = 0.5  # from this signal on an iteration may ask nothing
-# An answer that is expected to tell less is not asked for: it changes what is known about one question in a hundred.
-LEAST_INFORMATION = 0.01 * math.log(2)
-LEAST_BETWEEN = 3  # questions between one and its repetition, so that the answer is not remembered
-
-
-@dataclass(frozen=True)
-class Questions:
-    """How many questions are asked, and about which trajectories.
-
-    Attributes:
-      query: the rule that orders the trajectories, a name of `QUERY_RULES`; `other` is a rule of the user's.
-      queries_per_iteration, first_queries: M, in later iterations and in the first.
-      unasked_iterations: most iterations in a row without a question, at most half the answers so far (ties count),
-        once there is a preference. With a schedule that has a signal, only while the posterior has converged and the
-        signal is at least `UNASKED_SIGNAL`. The paper's is 0.
-      answers: the budget: most answers of the run, ties included; None for no limit.
-      same_start: whether a newcomer is compared with a trajectory from the same start, where there is one: the better
-        of two unlike starts says little about a policy. The paper compares it with the best of all.
-      worthwhile: whether a question is left out whose answer is expected to tell less than `LEAST_INFORMATION`.
-      clip_steps: length of the part of each trajectory, drawn at random, that questions are about; None: all of it. A
-        person sees a part in seconds.
-      repeats: share of the questions that are an earlier one with sides swapped. They are for people: the answers tell
-        how consistent each is. They count for the budget of answers, and not as those of an iteration.
-    """
-
-    query: str = "highest-utility"
-    queries_per_iteration: int = 1
-    first_queries: int = 2
-    unasked_iterations: int = 0
-    answers: int | None = None
-    same_start: bool = False
-    worthwhile: bool = False
-    clip_steps: int | None = None
-    repeats: float = 0.0
-
-    def __post_init__(self) -> None:
-        checks.one_of("query", self.query, (*QUERY_RULES, "other"))
-        checks.whole("queries_per_iteration", self.queries_per_iteration)
-        checks.whole("first_queries", self.first_queries)
-        checks.whole("unasked_iterations", self.unasked_iterations, 0)
-        checks.share("repeats", self.repeats, below_one=True)
-        if self.answers is not None:
-            checks.whole("answers", self.answers)
-        if self.clip_steps is not None:
-            checks.whole("clip_steps", self.clip_steps)
-        for name in ("same_start", "worthwhile"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
-        if self.same_start and self.clip_steps is not None:
-            raise ValueError("same_start: expected false with clip_steps, parts that begin anywhere, got true")
-
-    def clips(self, trajectories: Sequence[Trajectory], *, rng: np.random.Generator) -> list[list[int]] | None:
-        """First step and number of steps of the part of each trajectory that is compared; None: all of it."""
-        if self.clip_steps is None:
-            return None
-        lengths = [min(self.clip_steps, len(trajectory)) for trajectory in trajectories]
-        firsts = [rng.integers(len(each) - steps + 1) for each, steps in zip(trajectories, lengths, strict=True)]
-        return [[int(first), steps] for first, steps in zip(firsts, lengths, strict=True)]
-
-    def skips(self, preferences: Preferences, unasked: int, estimate: UtilityEstimate, signal: float | None) -> bool:
-        """Whether the next iteration asks nothing, after `unasked` in a row that asked nothing.
-
-        Decision: at most half the answers so far. Draws from two or three answers agree even where they are wrong.
-        """
-        if self.within_budget(1, preferences.answers) == 0:
-            return True
-        if unasked >= min(self.unasked_iterations, preferences.answers // 2) or not preferences.pairs:
-            return False
-        return signal is None or (estimate.quality.converged and signal >= UNASKED_SIGNAL)
-
-    def within_budget(self, wanted: int, answers: int) -> int:
-        """As many of `wanted` answers as the budget has left after so many."""
-        return int(max(0, min(wanted, self.left(answers))))
-
-    def left(self, answers: int) -> float:
-        """How many answers the budget has left after so many."""
-        return math.inf if self.answers is None else self.answers - answers
 
 
 @dataclass(frozen=True)
@@ -237,63 +158,6 @@ def candidates(rule: QueryRule, situation: QuerySituation) -> tuple[int, ...]:
 def random_candidates(numbers: Sequence[int], *, rng: np.random.Generator) -> tuple[int, ...]:
     """`numbers` in random order: the first iteration, before there is an estimate to choose by (paper, step 4)."""
     return tuple(int(number) for number in rng.permutation(np.asarray(numbers)))
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """Which questions an iteration asks.
-
-    Attributes:
-      wanted: how many answers.
-      candidates: trajectories to ask about, best first.
-      opponents: whom each is compared with; None: the newest undominated one.
-      information: what the answer to the first question is expected to tell, nats; None where that was not asked.
-    """
-
-    wanted: int = 0
-    candidates: tuple[int, ...] = ()
-    opponents: tuple[int, ...] | None = None
-    information: float | None = None
-
-
-def first_questions(
-    new: Sequence[int], opponents: Mapping[int, int], options: Questions, *, rng: np.random.Generator
-) -> Chosen:
-    """Random ones, before there is an estimate to choose by (paper, step 4); with opponents, each pair once."""
-    wanted = options.within_budget(options.first_queries, 0)
-    pairs = [number for number in new if opponents.get(number, number) < number]
-    candidates = random_candidates(pairs or new, rng=rng)
-    return Chosen(wanted, candidates, tuple(opponents[n] for n in candidates) if pairs else None)
-
-
-def later_questions(rule: QueryRule, situation: QuerySituation, options: Questions, *, answers: int) -> Chosen:
-    """Those of `rule`, after so many answers; none where the best is not worth asking."""
-    order, opponents, information = candidates(rule, situation), None, None
-    if options.same_start:
-        opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)
-    if options.worthwhile and situation.estimate.posterior is not None:
-        information = float(replace(situation, new=order[:1]).information()[0])
-    worth = information is None or information >= LEAST_INFORMATION
-    wanted = options.within_budget(options.queries_per_iteration, answers) if worth else 0
-    return Chosen(wanted, order, opponents, information)
-
-
-def repeated(
-    past: Sequence[PastQuestion], number: int, options: Questions, *, left: float, rng: np.random.Generator
-) -> PastQuestion | None:
-    """The earlier question that question `number` repeats; None where a new one is due.
-
-    Args:
-      past: the questions so far that were answered.
-      left: answers of the budget that nothing else is wanted for.
-      rng: chooses among the last answerer's that have not been repeated, without the last few.
-    """
-    done = {question.repeats for question in past}
-    if len(done - {None}) >= int(options.repeats * number + 1e-9) or left < 1:
-        return None
-    new = [each for each in past[:-LEAST_BETWEEN] if each.repeats is None and each.answer is not Answer.SKIP]
-    suitable = [each for each in new if each.number not in done and each.answerer == past[-1].answerer]
-    return suitable[rng.integers(len(suitable))] if suitable else None
 
 
 def _ordered(

@@ -14,7 +14,6 @@ from bayespbrl import (
     ReturnExpert,
     infer_utility,
     load,
-    queries,
     read_answers,
     resume,
     start,
@@ -27,6 +26,7 @@ from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.events import Entry, LearnerState, apply
 from bayespbrl.models import sample_posterior
 from bayespbrl.preferences import PastQuestion, Source
+from bayespbrl.questions import LEAST_BETWEEN
 from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.utility.comparisons import Comparisons
 
@@ -166,7 +166,7 @@ def test_a_share_of_the_questions_is_an_earlier_one_with_sides_swapped_and_its_a
         assert earlier.repeats is None
         assert (query.first, query.second) == (earlier.second, earlier.first)
         assert query.trajectories == earlier.trajectories[::-1]
-        assert query.number - earlier.number > queries.LEAST_BETWEEN
+        assert query.number - earlier.number > LEAST_BETWEEN
         # whoever always chooses the first contradicts themselves: both answers are data
         assert {(earlier.first, earlier.second), (query.first, query.second)} <= set(run.preferences.pairs)
     assert run.preferences.answers == len(asked)

@@ -23,7 +23,7 @@ ROOMS = {
     "step 1": ["utility"],
     "step 2": ["improvement"],
     "step 3": ["rollouts"],
-    "step 4": ["queries"],
+    "step 4": ["queries", "questions"],
     "settings": ["settings"],
     "events": ["events"],
     "learner": ["learner", "cycle"],

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.spaces import Discrete
 from toys import QUICK, Slope, fingerprint
 
-from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, resume, rollouts, start
+from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, questions, resume, rollouts, start
 from bayespbrl import cycle as cycle_module
 from bayespbrl.diagnostics.estimates import first_preferred_probability
 from bayespbrl.envs.gridworld import REWARDS
@@ -235,7 +235,7 @@ def test_bound_question_and_prediction_are_all_of_the_runs_one_posterior():
 @pytest.mark.slow
 @pytest.mark.parametrize("threshold", [0.0, 0.5, 1.1])
 def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
-    monkeypatch.setattr(queries, "UNASKED_SIGNAL", threshold)
+    monkeypatch.setattr(questions, "UNASKED_SIGNAL", threshold)
     options = {
         "preset": "paper",
         "utility": "posterior-mean",

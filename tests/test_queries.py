@@ -9,19 +9,16 @@ import pytest
 from bayespbrl.models.likelihoods import Logistic, Mixed, Probit, WithLapses
 from bayespbrl.preferences import Preferences, opponents_from_the_same_start, rivals, same_starts
 from bayespbrl.queries import (
-    LEAST_INFORMATION,
     QUERY_RULES,
     InformationWhenUnsure,
     QuerySituation,
-    Questions,
     candidates,
     expected_information,
-    first_questions,
-    later_questions,
     probability_better,
     random_candidates,
     show,
 )
+from bayespbrl.questions import LEAST_INFORMATION, Questions, first_questions, later_questions
 from bayespbrl.trajectories import Trajectory
 
 

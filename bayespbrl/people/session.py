@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bayespbrl import checks, events, queries
+from bayespbrl import checks, events, queries, questions
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.learner import Learner
@@ -25,7 +25,7 @@ from bayespbrl.preferences import Answer, parse_answer
 View = Mapping[str, Any]
 THINKING, QUESTION, FINISHED, FAILED = "thinking", "question", "finished", "failed"
 # An answer that is expected to tell less changes little: then the page says that a person may stop.
-LITTLE = queries.LEAST_INFORMATION / np.log(2)  # bits
+LITTLE = questions.LEAST_INFORMATION / np.log(2)  # bits
 
 
 class Stale(ValueError):

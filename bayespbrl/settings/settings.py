@@ -14,7 +14,7 @@ from bayespbrl.features import RadialBasisOptions
 from bayespbrl.improvement.problem import PolicyUpdate
 from bayespbrl.improvement.q_function import Critic
 from bayespbrl.models import PreferenceModel
-from bayespbrl.queries import Questions
+from bayespbrl.questions import Questions
 from bayespbrl.settings import presets
 from bayespbrl.settings.presets import Task, preset_options
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
