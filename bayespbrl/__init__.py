@@ -3,6 +3,7 @@
 from bayespbrl.experts import NoisyExpert, ReturnExpert, TerminalExpert
 from bayespbrl.learner import Learner
 from bayespbrl.preferences import Answer, Preferences, Query
+from bayespbrl.runs.answers_file import read_answers
 from bayespbrl.runs.run import Run, load, resume, start
 from bayespbrl.runs.utility_reward import UtilityReward
 from bayespbrl.settings import Settings
@@ -23,6 +24,7 @@ __all__ = [
     "UtilityReward",
     "infer_utility",
     "load",
+    "read_answers",
     "resume",
     "start",
 ]

@@ -147,3 +147,42 @@ def test_the_index_of_the_results_names_every_file_once_and_nothing_else():
     results = BENCHMARKS / "results"
     named = re.findall(r"^\| \[([^\]]+)\]\(\1\) \|", (results / "README.md").read_text(), flags=re.MULTILINE)
     assert sorted(named) == sorted(path.name for path in results.iterdir() if path.name != "README.md")
+
+
+def test_simulated_people_answer_as_their_parameters_say():
+    study = benchmark("simulated_people")
+    someone = study.People(steepness=2.0, threshold=0.5, lapse_rates=(0.0, 0.4), biases=(0.3, -0.2))
+    number = 20_000
+    margins, rng = np.full(number, 0.4), np.random.default_rng(1)
+    for who in (0, 1):
+        answers = someone.answers(rng, margins, np.full(number, who))
+        seen, lapse = 0.4 + someone.biases[who], someone.lapse_rates[who]
+        first, second = (1 / (1 + np.exp(-2 * (side * seen - 0.5))) for side in (1, -1))
+        expected = [
+            lapse / 2 + (1 - lapse) * second,
+            (1 - lapse) * (1 - first - second),
+            lapse / 2 + (1 - lapse) * first,
+        ]
+        np.testing.assert_allclose([np.mean(answers == a) for a in (-1, 0, 1)], expected, atol=0.015)
+
+
+def test_a_row_of_an_answer_is_the_preferred_less_the_other_with_its_side():
+    study = benchmark("simulated_people")
+    given = study.Questions(np.array([[1.0], [2.0], [3.0]]), np.array([0, 1, 0]), np.array([1, -1, 0]))
+    assert given.rows.ravel().tolist() == [1.0, -2.0, 3.0]
+    assert given.sides.tolist() == [1, -1, 1]
+
+
+@pytest.mark.slow
+def test_the_study_of_simulated_people_goes_on_where_it_was_cut(tmp_path, capsys):
+    study, file = benchmark("simulated_people"), tmp_path / "rows.csv"
+    (first,) = study.run([5], file)
+    with file.open("a") as rows:
+        rows.write("6,0.0,0.1")  # killed while it wrote
+    assert study.done(file) == [first]
+    rows = study.run([5, 6], file)
+    assert [row["seed"] for row in rows] == [5, 6]
+    assert rows[0] == first
+    assert [row["seed"] for row in study.done(file)] == [5, 6]
+    study.show(rows)
+    assert capsys.readouterr().out.startswith("2 runs, 2 converged")

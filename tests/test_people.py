@@ -7,7 +7,18 @@ import numpy as np
 import pytest
 from toys import QUICK, fingerprint
 
-from bayespbrl import Answer, Learner, Preferences, ReturnExpert, load, queries, resume, start
+from bayespbrl import (
+    Answer,
+    Learner,
+    Preferences,
+    ReturnExpert,
+    infer_utility,
+    load,
+    queries,
+    read_answers,
+    resume,
+    start,
+)
 from bayespbrl.diagnostics import people
 from bayespbrl.diagnostics.report import document as report_document
 from bayespbrl.diagnostics.report.contents import read_contents
@@ -16,6 +27,7 @@ from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.events import Entry, LearnerState, apply
 from bayespbrl.models import sample_posterior
 from bayespbrl.preferences import PastQuestion, Source
+from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.utility.comparisons import Comparisons
 
 OPTIONS = QUICK | {"iterations": 2}
@@ -307,3 +319,54 @@ def test_the_utility_without_one_person_is_that_of_the_others(answered_by_two):
     assert "answerer" not in estimate.posterior["posterior"].coords
     with pytest.raises(ValueError, match="answerer: expected one of 'Ada', 'Bob', got 'Eve'"):
         run.estimate_without("Eve")
+
+
+def test_the_answers_of_a_run_as_a_table_and_back(answered_by_two):
+    run = load(answered_by_two)
+    file = run.write_answers()
+    assert file == answered_by_two / "preferences.csv"
+    lines = file.read_text().splitlines()
+    assert lines[0] == "question,first,second,answer,answerer,seconds,repeats"
+    assert len(lines) == 1 + len(run.learner.state.past)
+    read = read_answers(file)
+    asked = [source for source in run.preferences.rows() if source.side]
+    assert read.pairs == tuple(run.preferences.pairs[source.number] for source in asked if not source.tied)
+    assert read.shown_first.tolist() == [source.side for source in asked]
+    assert list(read.answerers) == [source.answerer for source in asked]
+
+
+def test_answers_collected_elsewhere_by_hand(tmp_path):
+    file = write_answers(tmp_path / "answers.csv", PAST)
+    read = read_answers(file)
+    assert read.pairs == ((0, 1), (3, 2), (0, 1), (2, 3), (1, 0))
+    assert read.ties == ((4, 5),)
+    assert read.shown_first.tolist() == [1, -1, -1, -1, 1, 1]
+    assert read.answerers == ("Ada", "Ada", "Ada", "Ada", "Bob", "Bob")
+    utility = infer_utility(np.random.default_rng(0).normal(size=(6, 2)), **read._asdict())
+    assert set(utility.posterior["posterior"]["answerer"].values) == {"Ada", "Bob"}
+    (tmp_path / "plain.csv").write_text("answer,second,first\nsecond,0,1\nskip,2,1\n")
+    assert read_answers(tmp_path / "plain.csv")[:2] == (((0, 1),), ())
+    assert read_answers(tmp_path / "plain.csv").answerers is None
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("first,second\n0,1\n", "expected the columns first, second, answer, got none named answer"),
+        ("", "got none named first, second, answer"),
+        ("first,second,answer\n0,1,first\n0,x,first\n", "line 3: invalid literal"),
+        ("first,second,answer\n0,-1,first\n", "line 2: second: expected a whole number >= 0"),
+        ("first,second,answer\n0,0,first\n", "line 2: expected an answer about two different things"),
+        ("first,second,answer\n0,1,undo\n", "line 2: expected an answer about two different things"),
+        ("first,second,answer\n0,1,both\n", "line 2: expert: expected one of"),
+        ("first,second,answer\n0\n", "line 2: invalid literal"),
+        ("first,second,answer,answerer\n0,1,tie, \n", "line 2: answerer: expected a printable name"),
+    ],
+)
+def test_a_bad_table_of_answers_is_refused_by_its_line(tmp_path, text, expected):
+    (tmp_path / "answers.csv").write_text(text)
+    with pytest.raises(ValueError, match=expected) as refused:
+        read_answers(tmp_path / "answers.csv")
+    assert str(refused.value).startswith(str(tmp_path / "answers.csv"))
+    with pytest.raises(ValueError, match=r"missing\.csv: "):
+        read_answers(tmp_path / "missing.csv")

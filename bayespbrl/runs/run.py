@@ -18,6 +18,7 @@ from bayespbrl.policies import Policy
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
 from bayespbrl.queries import QueryRule, highest_utility
+from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.runs.directory import RunDirectory, fresh_directory
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
@@ -181,6 +182,10 @@ class Run:
         """
         state = self.learner.state
         return self.learner.cycle.estimate(replace(state, preferences=state.preferences.without(answerer)))
+
+    def write_answers(self, file: Path | str | None = None) -> Path:
+        """Write every answer as one line of a CSV file, `preferences.csv` of the run directory by default."""
+        return write_answers(self.path / "preferences.csv" if file is None else file, self.learner.state.past)
 
     def evaluate(self, episodes: int = 100, seed: int = 0) -> float:
         """Mean undiscounted return of `policy`, which is stochastic, over fresh episodes."""

@@ -1,0 +1,91 @@
+"""Answers as a table, one line a question: `preferences.csv` of a run, and answers that were collected elsewhere."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bayespbrl import checks
+from bayespbrl.preferences import Answer, PastQuestion, parse_answer
+from bayespbrl.runs.files import write_file
+
+COLUMNS = ("question", "first", "second", "answer", "answerer", "seconds", "repeats")
+NEEDED = ("first", "second", "answer")
+
+
+class CollectedAnswers(NamedTuple):
+    """Answers as `infer_utility` takes them: `infer_utility(feature_sums, **read_answers(file)._asdict())`.
+
+    Attributes:
+      pairs: (preferred, other), row numbers.
+      ties: pairs without a difference.
+      shown_first: 1 where the first of the pair, or of the tie, was shown first, else −1, shape (K,): pairs, then ties.
+      answerers: who gave each, in the same order, "" without a name; None where nobody has a name.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    ties: tuple[tuple[int, int], ...]
+    shown_first: np.ndarray
+    answerers: tuple[str, ...] | None
+
+
+def write_answers(file: Path | str, past: Sequence[PastQuestion]) -> Path:
+    """Write the questions that were answered, in their order, and return the path.
+
+    The columns are `question`, its number; `first` and `second`, the numbers of the trajectories in the order shown;
+    `answer`, one of first, second, tie and skip ("cannot tell"); `answerer`, `seconds` and `repeats`, the number of the
+    earlier question that it repeats, each empty where there is none.
+    """
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for each in past:
+        known = ("" if value is None else value for value in (each.answerer, each.seconds, each.repeats))
+        writer.writerow([each.number, each.first, each.second, str(each.answer), *known])
+    file = Path(file)
+    try:
+        write_file(file, table.getvalue())
+    except OSError as error:
+        raise ValueError(f"{file}: cannot write the answers there ({error})") from error
+    return file
+
+
+def read_answers(file: Path | str) -> CollectedAnswers:
+    """Answers of a run, or collected elsewhere, from a CSV file.
+
+    Args:
+      file: with a head and at least the columns `first`, `second` (whole numbers from 0, in the order shown) and
+        `answer`; `answerer` is read where it is there. Rows with the answer skip are left out.
+
+    Raises:
+      ValueError: a file that cannot be read, a missing column, or a bad row, by its line.
+    """
+    file = Path(file)
+    try:
+        lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8"), newline=""))
+        if missing := [name for name in NEEDED if name not in (lines.fieldnames or ())]:
+            raise ValueError(f"expected the columns {', '.join(NEEDED)}, got none named {', '.join(missing)}")
+        rows = [_row(line, lines.line_num) for line in lines]
+    except (OSError, ValueError, csv.Error) as error:
+        raise ValueError(f"{file}: {error}") from error
+    given = [row for row in rows if row[2] is not Answer.SKIP]
+    ordered = sorted(given, key=lambda row: row[2] is Answer.TIE)  # stable: pairs, then ties
+    every = [(second, first) if answer is Answer.SECOND else (first, second) for first, second, answer, _ in ordered]
+    number = sum(row[2] is not Answer.TIE for row in ordered)
+    names = tuple(row[3] for row in ordered)
+    sides = np.array([-1 if row[2] is Answer.SECOND else 1 for row in ordered], dtype=np.int64)
+    return CollectedAnswers(tuple(every[:number]), tuple(every[number:]), sides, names if any(names) else None)
+
+
+def _row(line: dict[str, str | None], number: int) -> tuple[int, int, Answer, str]:
+    try:
+        first, second = (checks.whole(name, int(line[name] or ""), 0) for name in ("first", "second"))
+        answer, name = parse_answer(line["answer"]), line.get("answerer") or ""
+        if first == second or answer is Answer.UNDO:
+            raise ValueError(f"expected an answer about two different things, got {line['answer']!r} about {first}")
+        return first, second, answer, checks.short_name("answerer", name) if name else ""
+    except ValueError as error:
+        raise ValueError(f"line {number}: {error}") from None
