@@ -20,6 +20,7 @@ import bayespbrl
 from bayespbrl.people.page import LARGEST_BODY, Page
 from bayespbrl.people.session import Session
 
+pytestmark = pytest.mark.slow
 FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -356,7 +357,6 @@ class Person:
         self.acknowledged.append(given)
 
 
-@pytest.mark.slow
 def test_a_server_that_is_killed_at_any_moment_loses_no_answer_and_counts_none_twice(tmp_path):
     options = QUICK | {"iterations": 12}
     bayespbrl.start("gridworld", tmp_path / "run", expert="page", **options)

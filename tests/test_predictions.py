@@ -3,9 +3,9 @@ import pytest
 import xarray as xr
 from scipy.special import expit, ndtr
 
-from bayespbrl.diagnostics import answer_probabilities
+from bayespbrl.diagnostics import answer_probabilities, prequential_predictions
 from bayespbrl.diagnostics.predictions import held_out_probabilities, refit
-from bayespbrl.models import PreferenceModel, sample_posterior
+from bayespbrl.models import Answers, PreferenceModel, sample_posterior
 from bayespbrl.models.low_rank import low_rank
 
 SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
@@ -133,3 +133,36 @@ def test_differences_that_do_not_fit_are_refused(bad):
     tree = sample_posterior(np.zeros((0, 3)), num_warmup=25, num_samples=25, max_samples=25)
     with pytest.raises(ValueError, match=r"differences: expected .* got"):
         answer_probabilities(tree, bad)
+
+
+def test_who_is_asked_and_which_side_is_shown_count_by_hand():
+    rows = np.array([[1.0], [0.6], [-0.5], [0.8], [-0.9], [0.3]])
+    sides, who = np.array([1, -1, 1, 1, 1, -1]), ["Ada", "Bob", "Bob", "Ada", "Bob", "Ada"]
+    tree = sample_posterior(rows, lapse_rate=None, likelihood="logistic", shown_first=sides, answerers=who)
+    drawn = tree["posterior"].dataset
+    asked = np.array([[0.4], [0.4], [-0.2]])
+
+    def by_hand(rate, bias):
+        margins = drawn["utility_weights"].values @ asked.T + bias
+        p = rate / 2 + (1 - rate) / (1 + np.exp(-5.0 * margins))
+        return p.mean(axis=(0, 1))
+
+    rates, biases = drawn["lapse_rate"].values, drawn["side_bias"].values
+    got = answer_probabilities(tree, asked, Answers(None, np.array([1, -1, 1]), ["Ada", "Bob", "Bob"]))
+    chosen = by_hand(rates[:, :, [0, 1, 1]], biases[:, :, [0, 1, 1]] * np.array([1, -1, 1]))
+    np.testing.assert_allclose(got[:, 0], chosen, atol=1e-9)
+    np.testing.assert_allclose(got.sum(axis=1), 1)
+    whoever = answer_probabilities(tree, asked)  # each answered three times
+    np.testing.assert_allclose(whoever[:, 0], by_hand(rates.mean(axis=2, keepdims=True), 0.0), atol=1e-9)
+    with pytest.raises(ValueError, match="answerers: expected names among Ada, Bob, got Eve"):
+        answer_probabilities(tree, asked, Answers(answerers=["Ada", "Bob", "Eve"]))
+
+
+def test_answers_with_sides_are_predicted_one_after_the_other():
+    rows, sides = np.array([[1.0], [0.6], [0.5]]), np.array([1, -1, 1])
+    answers = Answers(None, sides, ["Ada", "Bob", "Ada"])
+    first = sides > 0
+    predicted = prequential_predictions(rows, first, PreferenceModel(lapse_rate=None), answers=answers, num_samples=100)
+    assert predicted[0] == pytest.approx(0.5, abs=0.02)  # nothing is known yet
+    assert predicted[1] < 0.45  # the second shown is the better one, as Ada said
+    assert predicted[2] > 0.55

@@ -79,7 +79,8 @@ class Page:
     @property
     def address(self) -> str:
         """What to open in a browser."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/{self.token}/"
 
     def serve(self) -> None:
