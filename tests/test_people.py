@@ -307,6 +307,14 @@ def test_a_run_of_the_simulated_expert_has_no_section_on_people(tmp_path, monkey
     assert "## People" not in write_report(tmp_path / "run", format="md").read_text()
 
 
+def test_a_lapse_rate_that_was_set_has_no_interval_in_the_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")
+    run = start("gridworld", tmp_path / "run", **(OPTIONS | {"utility": "posterior-mean", "iterations": 1}))
+    run.run(ReturnExpert(), answerer="Ada")
+    text = write_report(tmp_path / "run", format="md").read_text()
+    assert "| 0 (set) | – | – |" in text  # a simulated expert favours no side
+
+
 def test_the_utility_without_one_person_is_that_of_the_others(answered_by_two):
     run = load(answered_by_two)
     assert run.preferences.answerers == ("Ada", "Bob")
