@@ -270,6 +270,13 @@ def test_lapse_rates_and_biases_are_each_persons_own():
     assert table["lapse_rate"][1] > table["lapse_rate"][0]  # Bob contradicts the others
 
 
+def test_who_answered_after_the_last_fit_has_no_lapse_rate_yet():
+    tree = sample_posterior(np.array([[1.0], [0.8]]), lapse_rate=None, num_samples=100)  # Ada's answers alone
+    table = people(PAST, tree)
+    assert float(table["lapse_rate"].sel(answerer="Ada")) == tree["posterior"]["lapse_rate"].values.mean()
+    assert np.isnan(float(table["lapse_rate"].sel(answerer="Bob")))
+
+
 @pytest.fixture(scope="module")
 def answered_by_two(tmp_path_factory) -> Path:
     """A run of two people: Ada knows what is better, Bob always takes the first at once."""
