@@ -1,6 +1,6 @@
 """Chains on everything that is unknown: Gibbs moves and elliptical slices, by one compiled sampler a capacity."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,14 +11,24 @@ from jax import Array, lax, random
 from jaxtyping import Float, Shaped
 from scipy.special import softmax
 
-from bayespbrl.models.elliptical_slice import Ellipse
+from bayespbrl.models.elliptical_slice import Ellipse, independent_move
 from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords, Values
 from bayespbrl.models.gaussian_fit import GaussianFit
-from bayespbrl.models.gibbs import JointProblem, Table, Unknowns, conditional, moved, prior_draws, stacked
-from bayespbrl.models.likelihoods import WithTies, log_prob, total_log_prob
+from bayespbrl.models.gibbs import (
+    JointProblem,
+    Table,
+    Unknowns,
+    conditional,
+    moved,
+    prior_draws,
+    reference_scale,
+    stacked,
+)
+from bayespbrl.models.likelihoods import WithTies, has_steps, log_prob, total_log_prob
 from bayespbrl.models.low_rank import used_rows
 from bayespbrl.models.preference_problem import (
     PreferenceProblem,
+    axis_ellipse,
     low_rank_model,
     padded_problem,
     prior_ellipse,
@@ -33,6 +43,17 @@ REFERENCE_POWER = 0.5
 # Moves around the reference's and the prior's ellipses per recorded draw; those around the prior's help in the tails.
 # They are made in so many sweeps, where more than the weights is unknown: lapse rate and weights move in turn.
 REFERENCE_MOVES, PRIOR_MOVES, SWEEPS = 26, 6, 6
+# Above so many answers, padding included, the moves are others, and the references are fitted again after the burn-in.
+FEW = 64
+# With steps: the same per sweep for at most so many dimensions, where so many independent draws are tried too; in more
+# dimensions every coordinate of the reference has a move of its own.
+LOW_DIMENSION, STEP_MOVES, INDEPENDENT = 32, 24, 256
+# Without steps the reference is nearly the posterior.
+SMOOTH_MOVES = 4
+# Of the reference that is fitted again: among contradicting answers the posterior is wider than any one Gaussian fit.
+LEAST_POWER = 0.2
+# The least lapse rate of a reference: with none, answers that contradict each other leave no Gaussian.
+LEAST_LAPSES = 0.005
 # Draws that one call of the compiled sampler makes; its length is part of what is compiled.
 CHUNK = 25
 
@@ -79,13 +100,47 @@ class Chains:
         # likely settings, but spread wider than the posterior over them: chains that agree have forgotten their start
         setting = rng.choice(len(fits), num_chains, p=softmax([0.5 * fit.log_evidence for fit in fits]))
         unknowns = Unknowns(*map(jnp.asarray, (setting, *prior_draws(problem, rng, num_chains))))
+        wider = np.asarray(reference_scale(problem, unknowns))[..., None]
         centres, roots = np.asarray(problem.settings.centre)[setting], np.asarray(problem.settings.root)[setting]
-        start = jnp.asarray(centres + np.einsum("cij,cj->ci", roots, rng.standard_normal(centres.shape)))
+        start = jnp.asarray(wider * (centres + np.einsum("cij,cj->ci", roots, rng.standard_normal(centres.shape))))
         zeros = jnp.zeros(num_chains)
         no = zeros.astype(bool)
         keys = jax.random.split(jax.random.key(seed), num_chains)
         state = EllipticalSliceState({"utility_weights": start}, zeros, zeros, no, no, keys)
         return cls(problem, state, unknowns, chunk, rank, len(fits[0].differences))
+
+    @property
+    def many(self) -> bool:
+        """Whether there are many answers."""
+        return self.problem.settings.loadings.shape[1] > FEW
+
+    def with_references(self, fits: Sequence[GaussianFit], values: Mapping[str, float]) -> "Chains":
+        """The same chains with the references of other fits, which were made at these values of the unknowns."""
+        rank = max(fit.factors.loadings.shape[1] for fit in fits)
+        settings = stacked(
+            [_with_reference(fit, rank, power) for fit, power in zip(fits, self._powers(fits), strict=True)]
+        )
+        fitted = None if self.problem.fitted_steepness is None else values["steepness"]
+        return replace(self, problem=self.problem._replace(settings=settings, fitted_steepness=fitted))
+
+    def _powers(self, fits: Sequence[GaussianFit]) -> list[float]:
+        """The power of each fit's Gaussian factors at which it is as wide as the last half of the draws."""
+        half = self.length // 2
+        z, setting = (self.collected(name, self.length)[:, half:] for name in ("coordinates", "setting"))
+        powers = []
+        for number, fit in enumerate(fits):
+            rank, site_precisions = fit.factors.loadings.shape[1], np.zeros(len(fit.differences))
+            away = z[setting == number][:, :rank] - fit.approximation.mean
+            site_precisions[used_rows(fit.factors.loadings)] = fit.approximation.site_precisions
+            margins = away @ fit.factors.loadings.T
+            squares = np.sum(away**2) / fit.model.prior_scale**2 + np.sum(site_precisions * margins**2)
+            powers.append(float(np.clip(rank * len(away) / max(squares, 1e-9), LEAST_POWER, 1.0)))
+        return powers
+
+    def means(self) -> dict[str, float]:
+        """Mean over all draws of steepness, lapse rate and tie threshold."""
+        names = ("steepness", "lapse_rate", "tie_threshold")
+        return {name: float(np.mean(self.values(name, self.length))) for name in names}
 
     @property
     def length(self) -> int:
@@ -125,6 +180,7 @@ def joint_problem(fits: Sequence[GaussianFit], by_answerer: Float[np.ndarray, "a
     def table(prior: Grid) -> Table:
         return Table(jnp.asarray(prior.values), jnp.log(jnp.asarray(prior.probabilities)))
 
+    scaled = len(fits[0].differences) > FEW and model.steepness is None and not has_steps(likelihood)
     return JointProblem(
         stacked(problems),
         jnp.full(len(fits), -np.log(len(fits))),
@@ -132,13 +188,15 @@ def joint_problem(fits: Sequence[GaussianFit], by_answerer: Float[np.ndarray, "a
         table(model.lapse_rate_prior),
         table(model.tie_threshold_prior if isinstance(likelihood, WithTies) else given(0.0)),
         jnp.asarray(one_hot),
+        model.steepness_prior.mean if scaled else None,
     )
 
 
-def _with_reference(fit: GaussianFit, rank: int) -> PreferenceProblem:
+def _with_reference(fit: GaussianFit, rank: int, power: float = REFERENCE_POWER) -> PreferenceProblem:
     """The problem of one setting, with the reference of its fit."""
     loadings, site_precisions = fit.factors.loadings, np.zeros(len(fit.differences))
-    site_precisions[used_rows(loadings)] = REFERENCE_POWER * fit.approximation.site_precisions
+    power = 1.0 if len(fit.differences) > FEW and not has_steps(fit.likelihood) else power
+    site_precisions[used_rows(loadings)] = power * fit.approximation.site_precisions
     return padded_problem(
         loadings,
         fit.likelihood,
@@ -151,6 +209,12 @@ def _with_reference(fit: GaussianFit, rank: int) -> PreferenceProblem:
 
 def _ellipses(model_args: Args, model_kwargs: Keywords, *, sweeps: int = 1) -> list[tuple[Ellipse, int]]:
     (problem,) = model_args
+    capacity, rank = problem.loadings.shape
+    if capacity > FEW:
+        if not has_steps(problem.likelihood):
+            return [(reference_ellipse(problem), SMOOTH_MOVES), (prior_ellipse(problem), 1)]
+        axes = [(axis_ellipse(problem), rank)] if rank > LOW_DIMENSION else []
+        return [*axes, (reference_ellipse(problem), STEP_MOVES), (prior_ellipse(problem), 1)]
     return [
         (reference_ellipse(problem), -(-REFERENCE_MOVES // sweeps)),
         (prior_ellipse(problem), -(-PRIOR_MOVES // sweeps)),
@@ -173,7 +237,9 @@ Recorded = tuple[EllipticalSliceState, Unknowns, Float[Array, "*draws k"]]
 def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem) -> Recorded:
     """One draw of one chain, and log p of each answer there."""
     unknown = any(len(prior) > 1 for prior in (problem.log_probabilities, *(table.values for table in problem[2:5])))
-    kernel, sweeps = (KERNEL_OF_SWEEP, SWEEPS) if unknown else (KERNEL, 1)
+    capacity, rank = problem.settings.loadings.shape[1:]
+    kernel, sweeps = (KERNEL_OF_SWEEP, SWEEPS) if unknown and capacity <= FEW else (KERNEL, 1)
+    independent = capacity > FEW and rank <= LOW_DIMENSION and has_steps(problem.settings.likelihood)
 
     def sweep(
         last: tuple[EllipticalSliceState, Unknowns], _: None
@@ -181,6 +247,9 @@ def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem)
         state, unknowns = last
         key, sub = random.split(state.rng_key)
         z, unknowns = moved(sub, state.z["utility_weights"], unknowns, problem)
+        if independent:
+            ellipse = reference_ellipse(conditional(problem, unknowns))
+            z = independent_move(random.fold_in(sub, 1), z, ellipse, candidates=INDEPENDENT)
         state = state._replace(z={"utility_weights": z}, rng_key=key)
         state = kernel.sample(state, (conditional(problem, unknowns),), {})
         return (state, unknowns), (state.candidates, state.stuck)

@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import chain_convergence
-from bayespbrl.models.gibbs import JointProblem, Unknowns, conditional, log_likelihood, prior_draws
+from bayespbrl.models.gibbs import JointProblem, Unknowns, conditional, log_likelihood, prior_draws, reference_scale
 
 NUMBER = 1000  # draws of each sample
 ITERATIONS = 30  # the fixed point converges geometrically
@@ -74,7 +74,7 @@ def _proposed(
     for number, root in enumerate(np.asarray(problem.settings.root)):
         chosen = setting == number
         points[chosen] += noise[chosen] @ root.T
-    return points, unknowns
+    return points * np.asarray(reference_scale(problem, Unknowns(*map(jnp.asarray, unknowns))))[..., None], unknowns
 
 
 @jax.jit

@@ -173,7 +173,7 @@ class _Factors:
 
 
 def expectation_propagation(
-    loadings: Float[np.ndarray, "k r"], mixture: ProbitMixture, *, prior_scale: float
+    loadings: Float[np.ndarray, "k r"], mixture: ProbitMixture, *, prior_scale: float, widening: bool = False
 ) -> GaussianApproximation:
     """Fit the posterior of z ~ N(0, σ²I_r) given answers to the margins t = L z.
 
@@ -181,6 +181,9 @@ def expectation_propagation(
       loadings: L.
       mixture: the answers' likelihood.
       prior_scale: σ > 0.
+      widening: whether the factor of a violated answer may widen its margin, down to a precision of 0 of all factors
+        together. Of many contradicting answers the fit is else too narrow, by a factor of two in the standard
+        deviation; of few it may not converge.
     """
     factors, answers = _Factors(loadings, mixture), len(loadings)
     loadings = loadings[factors.first]
@@ -191,7 +194,7 @@ def expectation_propagation(
     held = np.zeros(number, dtype=bool)
     while sweeps < MAX_SWEEPS and not converged and number:
         sweeps += 1
-        matched = _matched_sites(factors, gaussian, sites)
+        matched = _matched_sites(factors, gaussian, sites, widening)
         narrowed = np.where(factors.single, matched.precisions * prior.t_variance, 0.0)  # of several none can run away
         if np.any(narrowed[~held] > RUNAWAY):
             held |= narrowed > 0.01 * RUNAWAY
@@ -218,12 +221,12 @@ def _cavity(gaussian: _Gaussian, sites: _Sites) -> tuple[Float[np.ndarray, " k"]
     return (gaussian.t_mean - gaussian.t_variance * sites.shifts) * cavity, gaussian.t_variance * cavity
 
 
-def _matched_sites(factors: _Factors, gaussian: _Gaussian, sites: _Sites) -> _Sites:
+def _matched_sites(factors: _Factors, gaussian: _Gaussian, sites: _Sites, widening: bool) -> _Sites:
     """The sites whose product with the cavities has the tilted moments (Rasmussen & Williams 2006, eq. 3.59)."""
     cavity_mean, cavity_variance = _cavity(gaussian, sites)
     _, mean, variance = factors.moments(cavity_mean, cavity_variance)
     # a violated answer's factor can widen its margin: its precision is held at 0, its shift keeps the tilted mean
-    precisions = np.maximum(1 / variance - 1 / cavity_variance, 0.0)
+    precisions = np.maximum(1 / variance - 1 / cavity_variance, -np.inf if widening else 0.0)
     return _Sites(precisions, mean * (precisions + 1 / cavity_variance) - cavity_mean / cavity_variance)
 
 

@@ -1,7 +1,7 @@
 """A posterior's thin factorisation and Gaussian approximation: where sampling begins, and the marginal likelihood."""
 
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -61,12 +61,36 @@ def fit_gaussian(
     with one_blas_thread():
         factors = low_rank(differences)
         used = used_rows(factors.loadings)
-        mixture = likelihood.probit_mixture().of(used)
-        approximation = expectation_propagation(factors.loadings[used], mixture, prior_scale=model.prior_scale)
+        approximation = _approximation(factors, likelihood, model.prior_scale)
         log_evidence = approximation.log_evidence
         if not np.all(used):  # rows of zeros have a factor of their own; else nothing is compiled for a new K
             log_evidence += float(np.sum(np.log(prob(likelihood, np.zeros(number))[~used])))
     return GaussianFit(differences, model, factors, likelihood, approximation, log_evidence)
+
+
+def refitted(
+    fit: GaussianFit, model: PreferenceModel, number_of_preferences: int, tied: ArrayLike | None
+) -> GaussianFit:
+    """The same factorisation and likelihood with the Gaussian of another model, in which nothing is left to infer.
+
+    For many answers: the factor of a violated answer may widen the Gaussian, where that converges.
+    """
+    likelihood = model.answer_likelihood(number_of_preferences, tied)
+    with one_blas_thread():
+        approximation = None
+        with suppress(np.linalg.LinAlgError):  # wider than the prior allows
+            approximation = _approximation(fit.factors, likelihood, model.prior_scale, widening=True)
+        if approximation is None or not approximation.converged:
+            approximation = _approximation(fit.factors, likelihood, model.prior_scale)
+        return replace(fit, approximation=approximation)
+
+
+def _approximation(
+    factors: LowRank, likelihood: Likelihood, prior_scale: float, *, widening: bool = False
+) -> GaussianApproximation:
+    used = used_rows(factors.loadings)
+    mixture = likelihood.probit_mixture().of(used)
+    return expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale, widening=widening)
 
 
 @cache

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array, random
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from bayespbrl.models.likelihoods import Likelihood, Margins, Values, WithLapses, WithTies, log_prob
+from bayespbrl.models.likelihoods import Likelihood, Margins, Scalar, Values, WithLapses, WithTies, log_prob
 from bayespbrl.models.preference_problem import PreferenceProblem
 
 STACKED = ("loadings", "used", "centre", "site_precisions", "root", "inverse_root")
@@ -37,6 +37,8 @@ class JointProblem(NamedTuple):
       log_probabilities: of the settings, a priori.
       steepness, lapse_rate, tie_threshold: priors.
       answerers: who gave each answer, one-hot; zero in padded rows.
+      fitted_steepness: at which the references were fitted. They are scaled for any other steepness m, by it over m,
+        and m moves together with the weights. None: neither.
     """
 
     settings: PreferenceProblem
@@ -45,6 +47,7 @@ class JointProblem(NamedTuple):
     lapse_rate: Table
     tie_threshold: Table
     answerers: Float[Array, "a c"]
+    fitted_steepness: Scalar | None = None
 
 
 class Unknowns(NamedTuple):
@@ -88,8 +91,20 @@ def prior_draws(problem: JointProblem, rng: np.random.Generator, number: int) ->
 
 def conditional(problem: JointProblem, unknowns: Unknowns) -> PreferenceProblem:
     """The problem of the weights given all else."""
-    parts = {name: getattr(problem.settings, name)[unknowns.setting] for name in STACKED}
+    parts: dict[str, Array] = {name: getattr(problem.settings, name)[unknowns.setting] for name in STACKED}
+    if problem.fitted_steepness is not None:
+        scale = reference_scale(problem, unknowns)
+        parts = parts | {name: parts[name] * scale for name in ("centre", "root")}
+        parts |= {"inverse_root": parts["inverse_root"] / scale, "site_precisions": parts["site_precisions"] / scale**2}
+        parts["excess"] = (1 / scale**2 - 1) / problem.settings.prior_scale**2
     return problem.settings._replace(likelihood=_likelihood(problem, _point(problem, unknowns)), **parts)
+
+
+def reference_scale(problem: JointProblem, unknowns: Unknowns) -> Values:
+    """By how much the references are wider under these unknowns than as they were fitted."""
+    if problem.fitted_steepness is None:
+        return jnp.ones(())
+    return jnp.asarray(problem.fitted_steepness / problem.steepness.values[unknowns.steepness])
 
 
 def moved(
@@ -99,6 +114,8 @@ def moved(
     keys = random.split(key, 4)
     if len(problem.log_probabilities) > 1:
         z, unknowns = _setting_move(keys[0], z, unknowns, problem)
+    if problem.fitted_steepness is not None:
+        z, unknowns = _steepness_move(random.fold_in(key, 0), z, unknowns, problem)
     margins = problem.settings.loadings[unknowns.setting] @ z
     for key, name in zip(keys[1:], ("steepness", "lapse_rate", "tie_threshold"), strict=True):
         prior: Table = getattr(problem, name)
@@ -124,6 +141,25 @@ def _setting_move(
     log_p += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A|
     setting = random.categorical(key, log_p + problem.log_probabilities)
     return points[setting], unknowns._replace(setting=setting)
+
+
+def _steepness_move(
+    key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem
+) -> tuple[Float[Array, " q"], Unknowns]:
+    """Steepness m and weights z m₀/m drawn together, so that their product stays.
+
+    Many answers determine the product well, and neither m given z nor z given m could then move. Its r coordinates that
+    are no padding are scaled, which has the volume (m₀/m)^r.
+    """
+    values, loadings = problem.steepness.values, problem.settings.loadings[unknowns.setting]
+    scales = values[unknowns.steepness] / values
+    scaled = jnp.any(loadings != 0, axis=0)
+    points = jnp.where(scaled, scales[:, None] * z, z)
+    every = _point(problem, unknowns)._replace(steepness=values[:, None])
+    log_p = jnp.sum(_log_probabilities(problem, every, points @ loadings.T), axis=1)
+    log_p += problem.steepness.log_probabilities - 0.5 * jnp.sum(points**2, axis=1) / problem.settings.prior_scale**2
+    chosen = random.categorical(key, log_p + jnp.sum(scaled) * jnp.log(scales))
+    return points[chosen], unknowns._replace(steepness=chosen)
 
 
 def log_likelihood(problem: JointProblem, unknowns: Unknowns, margins: Margins) -> Values:

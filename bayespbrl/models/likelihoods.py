@@ -182,8 +182,10 @@ class WithLapses:
         """e is the larger exponent of both terms."""
         exponent, ratio = self.attentive.factor(margins)
         floor = jnp.log(self.lapse_rate / 2)
-        top = jnp.maximum(exponent, floor)
-        return top, jnp.exp(floor - top) + (1 - self.lapse_rate) * jnp.exp(exponent - top) * ratio
+        above = exponent > floor
+        smaller = jnp.exp(-jnp.abs(exponent - floor))  # of exp(e) and λ/2, over the larger
+        lapsed, attentive = jnp.where(above, smaller, 1.0), jnp.where(above, 1.0, smaller)
+        return jnp.maximum(exponent, floor), lapsed + (1 - self.lapse_rate) * attentive * ratio
 
     def probit_mixture(self) -> ProbitMixture:
         """The mixture shrunk, and a constant."""
@@ -228,6 +230,13 @@ class WithTies:
             np.concatenate([offsets + self.threshold, offsets - self.threshold]),
             np.concatenate([scales, scales]),
         )
+
+
+def has_steps(likelihood: Likelihood) -> bool:
+    """Whether it jumps, as eq. 8 does. Given many answers the posterior of any other is nearly Gaussian."""
+    if isinstance(likelihood, WithTies):
+        return has_steps(likelihood.ordered)
+    return has_steps(likelihood.attentive) if isinstance(likelihood, WithLapses) else isinstance(likelihood, Mixed)
 
 
 def likelihood_of(

@@ -42,7 +42,7 @@ def low_rank(differences: Float[np.ndarray, "k d"]) -> LowRank:
         return LowRank(loadings, basis)
     # QR first: its cost in D is that of one matrix product, and the decomposition that finds the rank is only (K, K)
     directions, triangle = np.linalg.qr((differences[used] / lengths[used, None]).T)
-    left, values, right = np.linalg.svd(triangle.T)
+    left, values, right = np.linalg.svd(triangle.T, full_matrices=False)
     rank = int(np.sum(values > values[0] * max(differences.shape) * np.finfo(float).eps))
     rotation, triangle = np.linalg.qr((left[:, :rank] * values[:rank]).T)
     rotation *= np.where(np.diag(triangle) < 0, -1.0, 1.0)

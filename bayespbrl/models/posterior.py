@@ -1,5 +1,6 @@
 """Step 1, Bayesian PBIRL: draws from p(w, all else | preferences), with their convergence (eqs. 7-8)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import jax
@@ -9,10 +10,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
-from bayespbrl.models.chains import CHUNK, Chains
+from bayespbrl.models.chains import CHUNK, LEAST_LAPSES, Chains
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.evidence import log_evidence
-from bayespbrl.models.gaussian_fit import fit_gaussian, one_blas_thread
+from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, one_blas_thread, refitted
+from bayespbrl.models.likelihoods import has_steps
 from bayespbrl.models.posterior_tree import margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
 
@@ -139,7 +141,14 @@ def posterior_draws(
             seed=seed,
             by_answerer=answers.by_answerer(settings.shape[1]),
         )
-        chains = replace(chains.extended(sampler.num_warmup), draws=())
+        chains = chains.extended(sampler.num_warmup)
+        if (
+            chains.many
+            and chains.draws
+            and (None in (model.steepness, model.lapse_rate) or has_steps(fits[0].likelihood))
+        ):
+            chains = _with_better_references(chains, fits, model, answers, number).extended(sampler.num_warmup)
+        chains = replace(chains, draws=())
         wanted = sampler.num_samples
         while True:
             chains = chains.extended(wanted - chains.length)
@@ -155,6 +164,18 @@ def posterior_draws(
         "log_evidence_error": evidence[1],
     }
     return posterior_tree(fits, chains, wanted, report, attributes, np.asarray(differences), answers)
+
+
+def _with_better_references(
+    chains: Chains, fits: Sequence[GaussianFit], model: PreferenceModel, answers: Answers, number: int
+) -> Chains:
+    """The chains with references fitted at the means of their draws so far: of many answers few values are likely."""
+    means = chains.means()
+    steepness = means["steepness"] if model.steepness is None else model.steepness
+    lapse_rate = max(means["lapse_rate"], LEAST_LAPSES) if model.lapse_rate is None else model.lapse_rate
+    threshold = means["tie_threshold"] if answers.indifferent is not None else model.tie_threshold
+    given = replace(model, steepness=steepness, lapse_rate=lapse_rate, tie_threshold=threshold)
+    return chains.with_references([refitted(fit, given, number, answers.indifferent) for fit in fits], means)
 
 
 def _diagnosed(

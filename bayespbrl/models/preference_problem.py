@@ -18,6 +18,9 @@ from bayespbrl.models.likelihoods import Likelihood, Scalar, WithTies, total_log
 from bayespbrl.models.low_rank import used_rows
 from bayespbrl.models.preference_model import preference_model
 
+# Candidates evaluated at once along one coordinate, where fewer than two are rejected in the mean.
+AXIS_BATCH = 3
+
 
 class PreferenceProblem(NamedTuple):
     """t = L z, z ~ N(0, σ²I): what the compiled sampler takes, padded to capacities c ≥ K and q ≥ r.
@@ -28,8 +31,9 @@ class PreferenceProblem(NamedTuple):
       likelihood: p; its arrays padded too.
       prior_scale: σ.
       centre: mean m of the reference.
-      site_precisions: s of the reference's precision I/σ² + Lᵀ diag(s) L.
+      site_precisions: s of the reference's precision (1/σ² + e) I + Lᵀ diag(s) L.
       root, inverse_root: A, with AAᵀ the reference's covariance, and A⁻¹.
+      excess: e; None for zero.
     """
 
     loadings: Float[Array, "c q"]
@@ -40,6 +44,7 @@ class PreferenceProblem(NamedTuple):
     site_precisions: Float[Array, " c"]
     root: Float[Array, "q q"]
     inverse_root: Float[Array, "q q"]
+    excess: Scalar | None = None
 
 
 def low_rank_model(problem: PreferenceProblem) -> None:
@@ -51,12 +56,15 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
     """Ellipses of N(m, AAᵀ) with v = (L(z − m), mᵀ(z − m)/σ², A⁻¹(z − m)), so that a candidate costs O(K).
 
     The reference differs from the prior by one Gaussian factor an answer, so that their ratio needs the margins alone:
-    log N(z; 0, σ²I) − log N(z; m, AAᵀ) = ½ Σ s_k (L(z − m))_k² − mᵀ(z − m)/σ² + a constant.
-    Rows that are not used have a margin of zero everywhere, so that they are constants too.
+    log N(z; 0, σ²I) − log N(z; m, AAᵀ) = ½ Σ s_k (L(z − m))_k² + ½ e |z − m|² − mᵀ(z − m)/σ² + a constant.
+    Rows that are not used have a margin of zero everywhere, so that they are constants too. With an excess e, v has
+    z − m too.
     """
     loadings, centre = problem.loadings, problem.centre
     number, rank = loadings.shape
     map_displacement = jnp.concatenate([loadings, centre[None] / problem.prior_scale**2])
+    if problem.excess is not None:
+        return _scaled_ellipse(problem, map_displacement, problem.excess)
     map_noise = (map_displacement @ problem.root).T
     margins_at_centre = loadings @ centre
 
@@ -73,6 +81,48 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
         return jnp.concatenate([whitened @ map_noise, whitened], axis=1)
 
     return Ellipse(lift, noise, residual, lambda v: centre + problem.root @ v[number + 1 :])
+
+
+def _scaled_ellipse(problem: PreferenceProblem, map_displacement: Float[Array, "rows q"], excess: Scalar) -> Ellipse:
+    """`reference_ellipse` with an excess: v = (L(z − m), mᵀ(z − m)/σ², z − m)."""
+    loadings, centre = problem.loadings, problem.centre
+    number, rank = loadings.shape
+    everything = jnp.concatenate([map_displacement, jnp.eye(rank)])
+    map_noise = (everything @ problem.root).T
+    margins_at_centre = loadings @ centre
+
+    def residual(v: Float[Array, "j v"]) -> Float[Array, " j"]:
+        margins, tilt, displacement = v[:, :number], v[:, number], v[:, number + 1 :]
+        log_likelihood = total_log_prob(problem.likelihood, margins_at_centre + margins)
+        squares = jnp.sum(problem.site_precisions * margins**2, axis=-1) + excess * jnp.sum(displacement**2, axis=-1)
+        return log_likelihood + 0.5 * squares - tilt
+
+    def noise(key: PRNGKeyArray, moves: int) -> Float[Array, "{moves} v"]:
+        return random.normal(key, (moves, rank), dtype=loadings.dtype) @ map_noise
+
+    return Ellipse(lambda z: everything @ (z - centre), noise, residual, lambda v: centre + v[number + 1 :])
+
+
+def axis_ellipse(problem: PreferenceProblem) -> Ellipse:
+    """Ellipses in one whitened coordinate of the reference at a time, in their order; the others stay.
+
+    With hundreds of steps an ellipse in all dimensions ends at the nearest; along one axis few are near.
+    """
+    reference = reference_ellipse(problem)
+    number, rank = problem.loadings.shape
+    map_displacement = jnp.concatenate([problem.loadings, problem.centre[None] / problem.prior_scale**2])
+    columns = jnp.concatenate([map_displacement @ problem.root, jnp.eye(rank)]).T
+
+    def noise(key: PRNGKeyArray, moves: int) -> Float[Array, "{moves} 2"]:
+        axes = jnp.arange(moves, dtype=columns.dtype) % rank
+        return jnp.stack([axes, random.normal(key, (moves,), dtype=columns.dtype)], axis=1)
+
+    def turn(v: Float[Array, " v"], fresh: Float[Array, "2"], angles: Float[Array, " j"]) -> Float[Array, "j v"]:
+        axis = fresh[0].astype(int)
+        step = v[number + 1 + axis] * (jnp.cos(angles) - 1) + fresh[1] * jnp.sin(angles)
+        return v + step[:, None] * columns[axis]
+
+    return reference._replace(noise=noise, turn=turn, batch=AXIS_BATCH)
 
 
 def prior_ellipse(problem: PreferenceProblem) -> Ellipse:

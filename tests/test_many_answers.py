@@ -1,0 +1,119 @@
+"""With many answers other moves and other references are used: the posterior is that of quadrature all the same."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayespbrl.models import PreferenceModel, fit_gaussian, priors, sample_posterior
+from bayespbrl.models.chains import FEW
+from bayespbrl.models.convergence import chain_convergence
+from bayespbrl.models.elliptical_slice import elliptical_moves, independent_move
+from bayespbrl.models.gaussian_fit import refitted
+from bayespbrl.models.likelihoods import likelihood_of, prob
+from bayespbrl.models.preference_problem import axis_ellipse, padded_problem, reference_ellipse
+
+GRID = np.linspace(-4.5, 4.5, 91)
+POINTS = np.stack(np.meshgrid(GRID, GRID, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def answers(number, *, seed, wrong=0.15):
+    """Differences of two features, some answered wrongly."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(number, 2)) / np.sqrt(2)
+    stated = np.sign(rows @ [1.0, 0.5]) * np.where(rng.random(number) < wrong, -1, 1)
+    return rows * stated[:, None]
+
+
+def log_density(rows, name, steepness, lapse_rate):
+    """log prior × likelihood at each point of the grid."""
+    likelihood = likelihood_of(name, float(len(rows)), steepness=steepness, lapse_rate=lapse_rate)
+    return np.sum(np.log(prob(likelihood, POINTS @ rows.T)), axis=1) - 0.5 * np.sum(POINTS**2, axis=1)
+
+
+def quadrature(rows, name):
+    """Posterior means of w₁, w₂, log m and λ, and the log marginal likelihood."""
+    total, sums = 0.0, np.zeros(4)
+    top = -0.5 * len(rows)
+    for steepness, p in zip(*priors.STEEPNESS, strict=True):
+        for lapse_rate, q in zip(*priors.LAPSE_RATE, strict=True):
+            mass = p * q * np.exp(log_density(rows, name, steepness, lapse_rate) - top)
+            total += mass.sum()
+            others = np.array([np.log(steepness), lapse_rate])
+            sums += np.append(mass @ POINTS, mass.sum() * others)
+    step = GRID[1] - GRID[0]
+    return sums / total, np.log(total * step**2 / (2 * np.pi)) + top
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mixed", "logistic"])
+def test_posterior_of_a_hundred_answers_is_that_of_quadrature(name):
+    rows = answers(100, seed=4)
+    assert len(rows) > FEW
+    tree = sample_posterior(
+        rows, likelihood=name, steepness=None, lapse_rate=None, num_samples=600, max_samples=600, seed=1
+    )
+    drawn = tree["posterior"].dataset
+    expected, log_evidence = quadrature(rows, name)
+    weights = np.concatenate([drawn["utility_weights"][:, :, :].values], axis=0)
+    columns = [weights, np.log(drawn["steepness"].values)[..., None], drawn["lapse_rate"].values]
+    draws = np.concatenate(columns, axis=2)
+    error = chain_convergence(draws).monte_carlo_error
+    assert np.all(np.abs(draws.mean(axis=(0, 1)) - expected) < 4 * error)
+    assert np.all(error < 0.15 * draws.std(axis=(0, 1)))
+    assert tree.attrs["log_evidence"] == pytest.approx(log_evidence, abs=4 * tree.attrs["log_evidence_error"] + 0.02)
+
+
+@pytest.mark.parametrize("move", ["axis", "independent"])
+def test_a_move_of_its_own_kind_leaves_the_posterior_as_it_is(move):
+    rows, steepness, lapse_rate = answers(70, seed=5), 5.0, 0.2
+    model = PreferenceModel(1.0, steepness, lapse_rate)
+    fit = fit_gaussian(rows, model)
+    with jax.enable_x64(True):
+        problem = padded_problem(
+            rows,
+            fit.likelihood,
+            prior_scale=1.0,
+            mean=fit.factors.basis @ fit.approximation.mean,
+            site_precisions=0.3 * fit.approximation.site_precisions,
+        )
+        problem = problem._replace(
+            loadings=problem.loadings[:, :2],
+            centre=problem.centre[:2],
+            root=problem.root[:2, :2],
+            inverse_root=problem.inverse_root[:2, :2],
+        )
+
+        def step(z, key):
+            if move == "axis":
+                z, _, _ = elliptical_moves(key, z, axis_ellipse(problem), moves=2, batch=4, max_candidates=200)
+            else:
+                z = independent_move(key, z, reference_ellipse(problem), candidates=64)
+            return z, z
+
+        start = jnp.tile(problem.centre, (8, 1))
+        keys = jax.random.split(jax.random.key(0), (8, 1500))
+        draws = np.asarray(jax.jit(jax.vmap(lambda z, k: jax.lax.scan(step, z, k)[1]))(start, keys))[:, 50:]
+    density = log_density(rows, "mixed", steepness, lapse_rate)
+    mass = np.exp(density - density.max())
+    mass /= mass.sum()
+    squares = np.concatenate([draws, draws**2], axis=2)
+    expected = np.append(mass @ POINTS, mass @ POINTS**2)
+    report = chain_convergence(squares)
+    assert report.effective_sample_size_min > 200
+    assert np.all(np.abs(squares.mean(axis=(0, 1)) - expected) < 4.5 * report.monte_carlo_error)
+
+
+def test_the_gaussian_of_many_contradicting_answers_is_as_wide_as_their_posterior():
+    rng = np.random.default_rng(0)
+    rows = answers(200, seed=6, wrong=0.1)
+    model = PreferenceModel(1.0, 5.0, 0.2)
+    fit = fit_gaussian(rows, model)
+    wider = refitted(fit, model, len(rows), None)
+    density = log_density(rows, "mixed", 5.0, 0.2)
+    mass = np.exp(density - density.max())
+    points = POINTS[rng.choice(len(POINTS), 4000, p=mass / mass.sum())] @ fit.factors.basis
+    exact = np.linalg.slogdet(np.cov(points.T))[1]
+    off = [abs(np.linalg.slogdet(each.approximation.covariance)[1] - exact) for each in (fit, wider)]
+    assert wider.approximation.converged
+    assert off[1] < off[0]
