@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from arviz_stats.base import array_stats
 
-from bayespbrl.models.convergence import chain_convergence
+from bayespbrl.models.convergence import ONE_BY_ONE, chain_convergence
 
 
 def test_independent_draws_are_worth_themselves():
@@ -47,8 +47,8 @@ def test_too_few_draws_are_named():
         chain_convergence(np.zeros(5))
 
 
-def test_the_numbers_are_those_of_arviz():
-    rng, number = np.random.default_rng(3), 24
+def test_the_numbers_of_many_quantities_at_once_are_those_of_arviz():
+    rng, number = np.random.default_rng(3), ONE_BY_ONE + 1
     for chains, length in ((4, 250), (2, 25), (3, 7)):
         draws, keep = np.zeros((chains, length, number)), rng.uniform(-0.9, 0.99, number)
         for step in range(1, length):
