@@ -270,6 +270,13 @@ def test_lapse_rates_and_biases_are_each_persons_own():
     assert table["lapse_rate"][1] > table["lapse_rate"][0]  # Bob contradicts the others
 
 
+def test_who_answered_after_the_last_fit_has_no_lapse_rate_yet():
+    tree = sample_posterior(np.array([[1.0], [0.8]]), lapse_rate=None, num_samples=100)  # Ada's answers alone
+    table = people(PAST, tree)
+    assert float(table["lapse_rate"].sel(answerer="Ada")) == tree["posterior"]["lapse_rate"].values.mean()
+    assert np.isnan(float(table["lapse_rate"].sel(answerer="Bob")))
+
+
 @pytest.fixture(scope="module")
 def answered_by_two(tmp_path_factory) -> Path:
     """A run of two people: Ada knows what is better, Bob always takes the first at once."""
@@ -305,6 +312,14 @@ def test_a_run_of_the_simulated_expert_has_no_section_on_people(tmp_path, monkey
     monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")
     start("gridworld", tmp_path / "run", **OPTIONS).run(ReturnExpert())
     assert "## People" not in write_report(tmp_path / "run", format="md").read_text()
+
+
+def test_a_lapse_rate_that_was_set_has_no_interval_in_the_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")
+    run = start("gridworld", tmp_path / "run", **(OPTIONS | {"utility": "posterior-mean", "iterations": 1}))
+    run.run(ReturnExpert(), answerer="Ada")
+    text = write_report(tmp_path / "run", format="md").read_text()
+    assert "| 0 (set) | – | – |" in text  # a simulated expert favours no side
 
 
 def test_the_utility_without_one_person_is_that_of_the_others(answered_by_two):

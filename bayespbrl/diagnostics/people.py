@@ -27,7 +27,12 @@ def people(past: Sequence[PastQuestion], posterior: xr.DataTree | None = None) -
       `seconds`, the median response time, NaN where none is known.
     """
     names = list(dict.fromkeys(question.answerer or "" for question in past))
-    rows = [_figures(name, [q for q in past if (q.answerer or "") == name], posterior) for name in names]
+    # a posterior that knows no names was fitted to one answerer: whoever answered first
+    alone = next((question.answerer or "" for question in past if question.answer is not Answer.SKIP), "")
+    rows = [
+        _figures(name, [q for q in past if (q.answerer or "") == name], _known_to(posterior, name, alone))
+        for name in names
+    ]
     columns = rows[0] if rows else _figures("", [], None)
     data = {name: ("answerer", np.array([row[name] for row in rows])) for name in columns}
     return xr.Dataset(data, coords={"answerer": np.array(names, dtype=object)})
@@ -58,12 +63,20 @@ def _figures(name: str, past: Sequence[PastQuestion], posterior: xr.DataTree | N
     return figures
 
 
+def _known_to(posterior: xr.DataTree | None, name: str, alone: str) -> xr.DataTree | None:
+    """The posterior, where answers of this person are among those that it was fitted to; else None."""
+    if posterior is None:
+        return None
+    drawn = posterior.children["posterior"].dataset
+    known = drawn["answerer"].values if "answerer" in drawn.coords else [alone]
+    return posterior if name in known else None
+
+
 def _draws(name: str, quantity: str, posterior: xr.DataTree | None) -> np.ndarray:
     """Posterior draws of one answerer's lapse rate or side bias; NaN where there are none."""
     drawn = None if posterior is None else posterior.children["posterior"].dataset
     if drawn is None or quantity not in drawn:
         return np.array([np.nan])
     if "answerer" in drawn.coords:
-        known = name in drawn["answerer"].values
-        return drawn[quantity].sel(answerer=name).values.ravel() if known else np.array([np.nan])
+        return np.asarray(drawn[quantity].sel(answerer=name).values.ravel())
     return np.asarray(drawn[quantity].values).ravel()

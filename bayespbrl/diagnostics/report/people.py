@@ -26,7 +26,8 @@ def people_section(contents: RunContents) -> Body:
     """The figures of each person, and a sentence on whoever needs one."""
     table = _table(contents)
     head = ["person", "answers", "ties", "cannot tell", "lapse rate", "side bias", "same on repeats", "median time"]
-    rows = [_row(table.isel(answerer=place)) for place in range(table.sizes["answerer"])]
+    given = contents.model.lapse_rate is not None
+    rows = [_row(table.isel(answerer=place), given=given) for place in range(table.sizes["answerer"])]
     caption = (
         "Everyone who answered, with 90 % intervals. Lapse rate: the share of answers that are coin tosses. Side bias: "
         "how much better the trajectory shown first looks, in standard deviations of the utility differences. Same on "
@@ -51,13 +52,15 @@ def _table(contents: RunContents) -> xr.Dataset:
     return people(contents.past, contents.posterior)
 
 
-def _row(one: xr.Dataset) -> list[str]:
+def _row(one: xr.Dataset, *, given: bool) -> list[str]:
     repeated, consistent, seconds = (float(one[name]) for name in ("repeated", "consistent", "seconds"))
     share = f"{consistent:.0f} of {repeated:.0f} ({_range(one, 'consistency')})" if repeated else "–"
     inferred = [
         "–" if np.isnan(float(one[name])) else f"{number(round(float(one[name]), 3))} ({_range(one, name)})"
         for name in ("lapse_rate", "side_bias")
     ]
+    if given:
+        inferred[0] = inferred[0].split(" ")[0] + " (set)"
     counts = [str(int(one[name])) for name in ("answers", "ties", "cannot_tell")]
     return [_name(one), *counts, *inferred, share, "–" if np.isnan(seconds) else f"{seconds:.1f} s"]
 
