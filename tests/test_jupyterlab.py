@@ -68,13 +68,12 @@ def test_a_scripted_person_answers_a_whole_run_in_jupyterlab(lab):
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         opened = browser.new_page(viewport={"width": 1100, "height": 1000})
+        opened.set_default_timeout(120_000)  # milliseconds; machines may be busy
         opened.goto(address)
-        opened.click(".jp-CodeCell .cm-content", timeout=60_000)
-        opened.wait_for_selector(
-            "[data-status=idle], .jp-Notebook-ExecutionIndicator[data-status=idle]", timeout=60_000
-        )
+        opened.click(".jp-CodeCell .cm-content")
+        opened.wait_for_selector("[data-status=idle], .jp-Notebook-ExecutionIndicator[data-status=idle]")
         opened.keyboard.press("Control+Enter")
-        opened.wait_for_selector(READY, timeout=60_000)
+        opened.wait_for_selector(READY)
         opened.click(".bp-ask")
         while questions := plain.ask():
             turn = opened.get_attribute(".bp-box", "data-turn")

@@ -73,6 +73,7 @@ def gridworld(tmp_path):
 def tab(browser, page, **options):
     """A tab of the browser in a context of its own, which shows a question."""
     context = browser.new_context(**options)
+    context.set_default_timeout(120_000)  # milliseconds; machines may be busy
     try:
         opened = context.new_page()
         opened.on("pageerror", lambda error: pytest.fail(f"JavaScript: {error}"))

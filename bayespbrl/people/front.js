@@ -1,7 +1,7 @@
 // The front end of the page and of the notebook's widget: two clips in step, a question, keys and buttons.
 //
 // `model` is anywidget's: get(name), send(message), on(event, callback), off(event, callback).
-//   view           what to show: {phase, turn, task, answered, budget, clips, rate, worth, sure, undo, say}
+//   view           what to show: {phase, turn, task, answered, budget, iteration, clips, rate, worth, sure, advice, undo, say}
 //   first, second  the sprite sheets of the two clips, bytes
 //   whole_page     whether keys count wherever the focus is
 // It sends {turn, answer, seconds} and hears, as "msg:custom", {refused: turn, say} and {connection: "lost" | "back"}.
@@ -153,8 +153,8 @@ function render({ model, el }) {
   }
 
   function say(text, aloud = text) {
-    ask.textContent = text;
-    if (aloud) live.textContent = aloud;
+    if (ask.textContent !== text) ask.textContent = text;
+    if (live.textContent !== aloud) live.textContent = aloud;
   }
 
   function warn(text) {
@@ -178,8 +178,9 @@ function render({ model, el }) {
     if (view.turn !== answered) clearTimeout(slow);
     if (view.phase !== "question") {
       lock(true);
-      find(".bp-learner").textContent = "";
-      say(view.phase === "thinking" || !view.phase ? "Thinking…" : view.say);
+      const thinking = view.phase === "thinking" || !view.phase;
+      find(".bp-learner").textContent = thinking && view.iteration ? `${view.iteration} iterations of the policy are done.` : "";
+      say(thinking ? "Thinking…" : view.say);
       return;
     }
     if (loaded !== view.turn) {

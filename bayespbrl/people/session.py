@@ -190,7 +190,7 @@ class Session:
             return
         if present.complete:
             self._publish(present)
-        elif self._view["turn"] != self._turn:
+        else:
             self._set(self._described(THINKING))
         self._changed.notify_all()
 
@@ -224,6 +224,7 @@ class Session:
             "task": re.sub(r"^bayespbrl/|-v\d+$", "", environment_name(self.learner.environment)),
             "answered": state.preferences.answers,
             "budget": settings.questions.answers,
+            "iteration": state.iteration,
             "undo": state.previous is not None,
             "say": "",
         }
