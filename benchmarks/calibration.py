@@ -8,6 +8,10 @@ the learner had when it asked; the first iteration, in which it had none, is lef
 expectation under the predictions themselves, in standard deviations: below −2 the predictions are overconfident. `ECE`
 is the expected calibration error over bins of width 0.1 of the confidence. The last column is the share of right
 predictions among those stated with at least 0.95.
+
+Two more tables follow, of the updates of all studies: how often an update was a gain of the hidden value, by the share
+of the posterior draws that called it one (agreement), and by the schedule's signal. Runs with a constant bound have
+neither.
 """
 
 import sys
@@ -15,20 +19,26 @@ from pathlib import Path
 
 import numpy as np
 
-from bayespbrl.diagnostics import score_predictions
+from bayespbrl.diagnostics import gain_calibration, score_predictions
 from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.preferences import Answer
 
 SURE = 0.95
 
 
-def predictions(study: Path) -> tuple[np.ndarray, np.ndarray, int]:
-    """Probability that the first shown is preferred, whether it was, for all answers of a study; number of runs."""
-    runs = (
-        [study] if (study / "settings.json").exists() else sorted(path.parent for path in study.glob("*/settings.json"))
-    )
+def run_directories(study: Path) -> list[Path]:
+    """The run directory itself, or those in it."""
+    if (study / "settings.json").exists():
+        return [study]
+    runs = sorted(path.parent for path in study.glob("*/settings.json"))
     if not runs:
         raise ValueError(f"{study}: expected a run directory or a folder of them, got none")
+    return runs
+
+
+def predictions(study: Path) -> tuple[np.ndarray, np.ndarray, int]:
+    """Probability that the first shown is preferred, whether it was, for all answers of a study; number of runs."""
+    runs = run_directories(study)
     asked = [answer for run in runs for answer in read_contents(run).answers]
     decided = [a for a in asked if a.iteration > 1 and a.row is not None and np.isfinite(a.predicted)]
     predicted = np.array([answer.predicted for answer in decided])
@@ -50,12 +60,25 @@ def row(study: Path) -> list[str]:
     return [study.name, str(runs), str(len(predicted)), *of_scores, sure]
 
 
+def print_gains(studies: list[str], statistic: str) -> None:
+    """How often an update was a gain, by a statistic of the schedule."""
+    runs = [read_contents(run).iterations for study in studies for run in run_directories(Path(study))]
+    result = gain_calibration(runs, statistic)
+    print(f"\n| {statistic} | updates | stated | gained ± standard error |\n|---|---|---|---|")
+    for n in np.flatnonzero(result["updates"].values > 0):
+        one = {name: float(values[n]) for name, values in result.data_vars.items()}
+        shares = f"{one['stated']:.2f} | {one['gained']:.2f} ± {one['standard_error']:.2f}"
+        print(f"| {one['lower']:g}–{one['upper']:g} | {one['updates']:.0f} | {shares} |")
+
+
 def main(studies: list[str]) -> None:
-    """Print the table as markdown."""
+    """Print the tables as markdown."""
     columns = ["study", "runs", "answers", "log score", "expected ± sd", "z", "ECE", f"right of those ≥ {SURE}"]
     print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
     for study in studies:
         print(f"| {' | '.join(row(Path(study)))} |", flush=True)
+    for statistic in ("agreement", "signal"):
+        print_gains(studies, statistic)
 
 
 if __name__ == "__main__":

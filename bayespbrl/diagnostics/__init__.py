@@ -5,6 +5,8 @@ Each result is an xarray `Dataset`. Each plot function draws on the matplotlib a
   chains          convergence: R̂, effective sample size, Monte Carlo error, rank plots
   predictions     posterior predictive probabilities of held-out answers, by exact refits
   prequential     calibration: each answer predicted before it was used
+  predictive_checks  posterior predictive checks: surprises, cycles and ties
+  gains           calibration of the schedule: was an update a gain as often as it said?
   comparison      models compared by k-fold cross-validation
   leave_one_out   influence of each answer on the posterior
   people          lapse rate, side bias and consistency of each answerer
@@ -18,10 +20,12 @@ Each result is an xarray `Dataset`. Each plot function draws on the matplotlib a
 
 from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ranks
 from bayespbrl.diagnostics.comparison import compare_likelihoods, plot_comparison
+from bayespbrl.diagnostics.gains import gain_calibration
 from bayespbrl.diagnostics.leave_one_out import influence, plot_influence
 from bayespbrl.diagnostics.people import people
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.predictions import answer_probabilities
+from bayespbrl.diagnostics.predictive_checks import predictive_checks
 from bayespbrl.diagnostics.prequential import calibration, plot_calibration, prequential_predictions, score_predictions
 
 __all__ = [
@@ -29,6 +33,7 @@ __all__ = [
     "calibration",
     "compare_likelihoods",
     "convergence",
+    "gain_calibration",
     "influence",
     "people",
     "plot_calibration",
@@ -37,6 +42,7 @@ __all__ = [
     "plot_influence",
     "plot_ranks",
     "plot_sensitivity",
+    "predictive_checks",
     "prequential_predictions",
     "score_predictions",
     "sensitivity",

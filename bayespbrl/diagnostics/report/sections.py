@@ -9,6 +9,7 @@ import xarray as xr
 from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ranks
 from bayespbrl.diagnostics.estimates import of_states
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
+from bayespbrl.diagnostics.predictive_checks import predictive_checks
 from bayespbrl.diagnostics.prequential import plot_calibration
 from bayespbrl.diagnostics.report import figures
 from bayespbrl.diagnostics.report.contents import RunContents
@@ -127,8 +128,27 @@ def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
         f"Reliability curve of {total} predictions.",
         size=(5.6, 4.0),
     )
+    blocks: list[Block] = [curve, table]
+    if contents.posterior is not None:
+        blocks.append(_predictive_checks(contents.posterior))
     few = ["The band is wide with so few answers: little can be concluded."] if total < FEW_ANSWERS else []
-    return few, [curve, table]
+    return few, blocks
+
+
+def _predictive_checks(tree: xr.DataTree) -> Table:
+    """Counts in the answers beside those in answers that the last posterior simulates."""
+    result = predictive_checks(tree)
+    caption = (
+        "Posterior predictive checks: the answers given, beside answers simulated by the last posterior. Surprises "
+        "contradict the inferred utility; cycles are triads that no utility can order. A p-value below 0.01 or above "
+        "0.99 says that the model does not explain this count."
+    )
+    rows = []
+    for name in result["check"].values[result["possible"].values > 0]:
+        row = {key: float(value) for key, value in result.sel(check=name).data_vars.items()}
+        interval = f"{number(row['expected'])} [{number(row['lower'])}, {number(row['upper'])}]"
+        rows.append([str(name), number(row["observed"]), f"{int(row['possible'])}", interval, number(row["p_value"])])
+    return Table(caption, ["count", "in the answers", "of", "simulated [90 %]", "p"], rows)
 
 
 def updates(iterations: xr.Dataset) -> Body:

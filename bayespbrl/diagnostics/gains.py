@@ -1,0 +1,59 @@
+"""Calibration of the schedule's confidence: how often was an update a gain, by what the schedule said of it?
+
+For runs whose hidden reward is known: it never enters the learner, and here it is the judge.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+EDGES = (0.0, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0)
+
+
+def gain_calibration(
+    runs: Iterable[Sequence[Mapping[str, Any]]], statistic: str = "agreement", *, edges: Sequence[float] = EDGES
+) -> xr.Dataset:
+    """How often the newest policy's value rose, by the `agreement` or the `signal` that the schedule reported.
+
+    The first iteration of a run has no value before it, and one without the statistic has no place: both are left out.
+
+    Args:
+      runs: the iterations' summaries of each run.
+      statistic: `agreement`, the share of the posterior draws that call the update a gain; `signal`; or any other
+        statistic of the schedule in [0, 1].
+      edges: of the bins, increasing; the last is closed.
+
+    Returns:
+      along `bin`: `lower` and `upper` edge, `updates` (their number), `stated` (mean statistic), `gained` (the share
+      that was a gain) and its `standard_error`; NaN where a bin is empty.
+
+    Raises:
+      ValueError: edges that do not increase.
+    """
+    bounds = np.asarray(edges, dtype=float)
+    if bounds.ndim != 1 or len(bounds) < 2 or np.any(np.diff(bounds) <= 0):
+        raise ValueError(f"edges: expected at least two increasing numbers, got {edges!r}")
+    pairs = [pair for summaries in runs for pair in _stated_and_gained(summaries, statistic)]
+    stated, gained = np.reshape(np.array(pairs, dtype=float), (-1, 2)).T
+    place = np.clip(np.searchsorted(bounds, stated, side="right") - 1, 0, len(bounds) - 2)
+    counts = np.bincount(place, minlength=len(bounds) - 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = np.bincount(place, stated, len(bounds) - 1) / counts
+        share = np.bincount(place, gained, len(bounds) - 1) / counts
+        error = np.sqrt(share * (1 - share) / counts)
+    data = {"lower": bounds[:-1], "upper": bounds[1:], "updates": counts, "stated": mean, "gained": share}
+    return xr.Dataset({name: ("bin", values) for name, values in (data | {"standard_error": error}).items()})
+
+
+def _stated_and_gained(summaries: Sequence[Mapping[str, Any]], statistic: str) -> list[tuple[float, bool]]:
+    found = []
+    for before, after in pairwise(summaries):
+        figures = [summary.get("value_newest", summary.get("value")) for summary in (before, after)]
+        figures.append((after.get("schedule") or {}).get(statistic))
+        if all(isinstance(figure, int | float) and np.isfinite(figure) for figure in figures):
+            old, new, stated = (float(figure) for figure in figures)
+            found.append((stated, new > old))
+    return found
