@@ -24,6 +24,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+ImportPackage = Annotated[
+    bool, typer.Option("--import-package", help="Import the package that the run's environment names (it runs code).")
+]
 Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot, or any gymnasium id.")]
 
 
@@ -91,9 +94,13 @@ def run(
 
 
 @app.command()
-def resume(directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")]) -> None:
+def resume(
+    directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")],
+    *,
+    import_package: ImportPackage = False,
+) -> None:
     """Continue an interrupted run; no answer is asked for twice."""
-    learner = runs.resume(directory)
+    learner = runs.resume(directory, import_package=import_package)
     if not learner.finished:
         _check_expert(learner.settings.expert)
         run_to_the_end(learner, directory)
@@ -107,11 +114,12 @@ def resume(directory: Annotated[Path, typer.Argument(help="Directory of an inter
 def report(
     directory: Annotated[Path, typer.Argument(help="Directory of a run: finished, in progress or damaged.")],
     format: Annotated[str, typer.Option(help="html (one file) or md (with a folder of pictures).")] = "html",
+    import_package: ImportPackage = False,
 ) -> None:
     """Write the diagnostic report of a run into its directory."""
     from bayespbrl.diagnostics.report import write_report
 
-    console.print(f"Report: {write_report(directory, format=format)}")
+    console.print(f"Report: {write_report(directory, format=format, import_package=import_package)}")
 
 
 @app.command()
