@@ -138,7 +138,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
         case "answered":
             return _answered(state, event)
         case "improved":
-            check = event["summary"].get("check")  # of a checked update
+            check = _with_figures(event["summary"]).get("check")  # of a checked update
             tried_is_best = check is not None and check["best"] == state.iteration
             return replace(
                 state,
@@ -200,6 +200,23 @@ def surviving(log: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
             raise ValueError("undo: expected an answer to take back, got none yet")
         del kept[answers[-1] :]
     return kept
+
+
+def _with_figures(summary: Any) -> Mapping[str, Any]:
+    """`summary`, where it has what all its readers need; `ValueError` where it has not."""
+    if not has_figures(summary):
+        raise ValueError(f"improved: expected a summary with answers and value, got {str(summary)[:60]}")
+    return dict(summary)
+
+
+def has_figures(summary: Any) -> bool:
+    """Whether the summary of an iteration has what all its readers need: its number, answers and value."""
+    if not isinstance(summary, Mapping):
+        return False
+    return all(
+        isinstance(summary.get(name), int | float) and not isinstance(summary[name], bool)
+        for name in ("iteration", "answers", "value")
+    )
 
 
 def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:

@@ -251,6 +251,8 @@ class FeatureSource:
 def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."]) -> Float[np.ndarray, "n d"]:
     """`features(states)` as finite float64 numbers of shape (N, D); `ValueError` where it is anything else."""
     name = getattr(features, "__name__", type(features).__name__)
+    if not callable(features):
+        raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
     values = np.asarray(features(states))
     if values.ndim != 2 or len(values) != len(states) or values.shape[1] == 0:
         raise ValueError(f"features {name}: expected shape ({len(states)}, D), got {values.shape}")

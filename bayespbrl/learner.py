@@ -14,6 +14,7 @@ from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
+from bayespbrl.policies import Policy
 from bayespbrl.policies.choice import initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
 from bayespbrl.settings import Settings, Task, settings_for
@@ -58,6 +59,13 @@ class Learner:
     ):
         self.environment = rollouts.open_environment(env)
         self.given = env if isinstance(env, gymnasium.Env) else as_given(self.environment)
+        for name, given in (("features", features), ("schedule", schedule), ("query", query)):
+            if given is not None and not callable(given) and (name == "features" or not isinstance(given, str)):
+                raise ValueError(
+                    f"{name}: expected a function{'' if name == 'features' else ' or a name'}, got {given!r}"
+                )
+        if policy is not None and not isinstance(policy, str | Policy):
+            raise ValueError(f"policy: expected a policy (bayespbrl.policies) or a kind by name, got {policy!r}")
         if "environment" in options:
             raise ValueError("settings: expected env alone to say which environment, got environment too")
         own_policy = None if policy is None or isinstance(policy, str) else policy
@@ -222,6 +230,8 @@ class Learner:
           answerer: the name of a person who answers; how long each answer took is then kept too.
           progress: called after each iteration, those that ask nothing among them.
         """
+        if not callable(expert):
+            raise ValueError(f"expert: expected a function of two trajectories, got {expert!r}")
         self._advance(progress)
         while questions := self._waiting():
             began = time.perf_counter()

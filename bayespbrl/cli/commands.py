@@ -39,6 +39,9 @@ Answerer = Annotated[
     str | None,
     typer.Option(help="Name or pseudonym of the person who answers; it is kept with each answer and its time."),
 ]
+ImportPackage = Annotated[
+    bool, typer.Option("--import-package", help="Import the package that the run's environment names (it runs code).")
+]
 Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot, or any gymnasium id.")]
 
 
@@ -114,11 +117,14 @@ def run(
 
 @app.command()
 def resume(
-    directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")], *, answerer: Answerer = None
+    directory: Annotated[Path, typer.Argument(help="Directory of an interrupted run.")],
+    *,
+    answerer: Answerer = None,
+    import_package: ImportPackage = False,
 ) -> None:
     """Continue an interrupted run; no answer is asked for twice."""
     with continuing(directory):
-        learner = runs.resume(directory)
+        learner = runs.resume(directory, import_package=import_package)
         if not learner.finished:
             _check_expert(learner.settings.expert, answerer)
             run_to_the_end(learner, directory, answerer=answerer)
@@ -136,10 +142,11 @@ def ask(
     answerer: Answerer = None,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; a free one if omitted.")] = 0,
+    import_package: ImportPackage = False,
 ) -> None:
     """Ask a person the questions of a run on a page in the browser; repeat the command to go on later."""
     with continuing(directory):
-        learner = runs.resume(directory)
+        learner = runs.resume(directory, import_package=import_package)
         if learner.finished:
             raise ValueError(f"{directory}: this run is finished; there is nothing left to ask")
         if (expert := learner.settings.expert) in SIMULATED:
@@ -153,11 +160,12 @@ def ask(
 def report(
     directory: Annotated[Path, typer.Argument(help="Directory of a run: finished, in progress or damaged.")],
     format: Annotated[str, typer.Option(help="html (one file) or md (with a folder of pictures).")] = "html",
+    import_package: ImportPackage = False,
 ) -> None:
     """Write the diagnostic report of a run into its directory."""
     from bayespbrl.diagnostics.report import write_report
 
-    console.print(f"Report: {write_report(directory, format=format)}")
+    console.print(f"Report: {write_report(directory, format=format, import_package=import_package)}")
 
 
 @app.command()

@@ -1,5 +1,6 @@
 """Any gymnasium environment, made ready for the learner: opened by name, its spaces checked and flattened."""
 
+import sys
 from importlib import import_module
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -20,6 +21,15 @@ AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
 _MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
 # What `flattened` wrapped.
 _GIVEN: WeakKeyDictionary[gymnasium.Env, gymnasium.Env] = WeakKeyDictionary()
+
+
+def imported_by_name(environment: Any) -> str:
+    """The module that opening `environment` would import, as gymnasium's "module:Env-v0"; empty for none.
+
+    One that is imported already is none.
+    """
+    module = environment.rpartition(":")[0] if isinstance(environment, str) else ""
+    return "" if module in sys.modules else module
 
 
 def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
@@ -100,7 +110,7 @@ def _spec(environment: str | EnvSpec) -> EnvSpec:
         if module:
             import_module(module)
         return gymnasium.spec(name)
-    except (gymnasium.error.Error, ImportError) as error:
+    except Exception as error:  # a module of the user's may raise anything
         raise ValueError(
             f"environment: expected {', '.join(SHORT_NAMES)} or a registered gymnasium id, got {environment!r} "
             f"({_one_line(error)})"
@@ -149,6 +159,16 @@ def _plain_space(space: Any) -> Any:
             return space
         return Box(space.low.reshape(-1), space.high.reshape(-1), dtype=space.dtype.type)
     return space if space.start == 0 else Discrete(int(space.n))
+
+
+def check_of_space(name: str, values: np.ndarray, space: Any) -> None:
+    """That rows are of a flattened space: shape (N, n), or whole numbers below its size; `ValueError` else."""
+    if isinstance(space, Discrete):
+        fits = values.ndim == 1 and values.dtype.kind in "iu" and bool(np.all((values >= 0) & (values < space.n)))
+    else:
+        fits = values.ndim == 2 and values.dtype.kind == "f" and values.shape[1:] == space.shape
+    if not fits:
+        raise ValueError(f"{name}: expected entries of {space}, got {values.dtype} of shape {values.shape}")
 
 
 def to_plain(space: Any, value: Any) -> Any:

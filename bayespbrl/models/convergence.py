@@ -1,8 +1,8 @@
 """Convergence of Markov chains: R̂, effective sample size and Monte Carlo error of many quantities at once.
 
-The rank-normalised R̂ and bulk effective sample size are those of Vehtari et al. (2021), by ArviZ. It diagnoses one quantity
-after the other, and hundreds of margins would take longer to diagnose than to sample: then the same formulas are evaluated
-here for all at once, with the same numbers.
+The rank-normalised R̂ and bulk effective sample size are those of Vehtari et al. (2021), by ArviZ. It diagnoses one
+quantity after the other, and hundreds of margins would take longer to diagnose than to sample: then the same formulas
+are evaluated here for all at once, with the same numbers.
 """
 
 from dataclasses import dataclass

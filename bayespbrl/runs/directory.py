@@ -17,7 +17,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from bayespbrl.events import Entry, LearnerState, surviving
+from bayespbrl.events import Entry, LearnerState, has_figures, surviving
 from bayespbrl.features import StateFeatures
 from bayespbrl.runs.files import write_file
 from bayespbrl.runs.iteration_files import read_iteration, write_iteration
@@ -217,7 +217,7 @@ def read_log_lines(file: Path) -> list[Event | ValueError]:
 def _event(number: int, line: bytes) -> Event | ValueError:
     try:
         event = json.loads(line.decode())
-    except ValueError:
+    except (ValueError, RecursionError):
         event = None
     named = isinstance(event, dict) and "event" in event
     if named and (event["event"] not in HEAVY or type(event.get("iteration")) is int):
@@ -234,9 +234,25 @@ def read_summary(directory: Path | str) -> dict[str, Any]:
     return summary
 
 
+def read_complete_summary(directory: Path | str) -> dict[str, Any]:
+    """`read_summary`, of a run with at least one iteration, each with its figures; `ValueError` where it has others."""
+    summary, file = read_summary(directory), Path(directory) / "summary.json"
+    entries = summary["iterations"]
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(f"{file}: expected at least one iteration, got {entries!r}")
+    for number, entry in enumerate(entries, start=1):
+        if not has_figures(entry):
+            raise ValueError(f"{file}: expected answers and value in iteration {number}, got {str(entry)[:60]}")
+    if type(summary["seed"]) is not int or not isinstance(summary.get("env"), str) or "utility" not in summary:
+        raise ValueError(f"{file}: expected seed, env and utility of a run, got others")
+    return summary
+
+
 def _read_json(file: Path, expected: str) -> Any:
     try:
         return json.loads(file.read_text())
+    except RecursionError as error:
+        raise ValueError(f"{expected}, got brackets nested too deeply") from error
     except (OSError, ValueError) as error:
         raise ValueError(f"{expected}, got {error}") from error
 

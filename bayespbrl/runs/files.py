@@ -1,9 +1,12 @@
 """Files that are on the disk whole or not at all: written aside, flushed, renamed into place."""
 
+import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+import xarray as xr
 
 
 @contextmanager
@@ -19,9 +22,21 @@ def written_aside(file: Path) -> Iterator[Path]:
         with aside.open("r+b") as written:
             os.fsync(written.fileno())
         aside.replace(file)
-    except BaseException:
+    except BaseException as error:
         aside.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None and error.filename is None:  # a full disk
+            raise OSError(error.errno, error.strerror, str(file)) from error
         raise
+
+
+def write_netcdf(file: Path, data: xr.Dataset | xr.DataTree) -> None:
+    """Write a netCDF file, whole or not at all.
+
+    HDF5 ends the process where the disk is full while it writes to it; the bytes are therefore made in memory.
+    """
+    content = io.BytesIO()
+    data.to_netcdf(content, engine="h5netcdf")
+    write_file(file, content.getvalue())
 
 
 def write_file(file: Path, content: str | bytes) -> None:

@@ -10,13 +10,14 @@ import xarray as xr
 from bayespbrl.events import Entry
 from bayespbrl.features import StateFeatures
 from bayespbrl.models import restored, stored
-from bayespbrl.runs.files import written_aside
+from bayespbrl.runs.files import write_netcdf
 from bayespbrl.runs.stored_classes import from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEstimate
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Final = "h5netcdf"
+MOST_BYTES_A_BYTE = 16  # arrays of a file in bytes, by its size
 PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "policy", "estimate")}
 
 
@@ -27,8 +28,7 @@ def write_iteration(file: Path, entry: Entry) -> None:
     if "policy" in parts:
         groups["policy"] = to_tree(parts["policy"])
         groups |= _estimate_groups(parts["estimate"])
-    with written_aside(file) as aside:
-        xr.DataTree.from_dict(groups).to_netcdf(aside, engine=ENGINE)
+    write_netcdf(file, xr.DataTree.from_dict(groups))
 
 
 def read_iteration(
@@ -58,13 +58,30 @@ def read_parts(
         "estimate": lambda tree: _read_estimate(tree, features, known),
     }
     try:
-        with xr.open_datatree(file, engine=ENGINE) as opened:
+        with xr.open_datatree(file, engine=ENGINE, decode_times=False) as opened:
+            _check_size(file, opened)
             tree = opened.load()
+        _check_numbers(tree)
         parts = {name: read[name](tree) for name in names}
-    except (OSError, KeyError, RuntimeError, AttributeError, TypeError, ValueError) as error:
+    except (OSError, KeyError, RuntimeError, AttributeError, TypeError, ValueError, MemoryError, IndexError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{file.name}: expected the netCDF file of an iteration, got {reason}") from error
     return parts
+
+
+def _check_size(file: Path, tree: xr.DataTree) -> None:
+    """That a file does not claim more than it holds: what a run writes is not compressed."""
+    claimed, held = sum(node.dataset.nbytes for node in tree.subtree), file.stat().st_size
+    if claimed > MOST_BYTES_A_BYTE * held:
+        raise ValueError(f"{claimed} bytes of arrays in a file of {held} bytes")
+
+
+def _check_numbers(tree: xr.DataTree) -> None:
+    """That all arrays are numbers; labels of the posterior's dimensions may be text."""
+    for node in tree.subtree:
+        for name, variable in node.data_vars.items():
+            if variable.dtype.kind not in "biuf":
+                raise ValueError(f"expected numbers as {name}, got {variable.dtype}")
 
 
 def _trajectories_dataset(trajectories: Sequence[Trajectory]) -> xr.Dataset:
@@ -92,6 +109,8 @@ def _trajectories_dataset(trajectories: Sequence[Trajectory]) -> xr.Dataset:
 
 def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
     states, actions, rewards = data["states"].values, data["actions"].values, data["rewards"].values
+    if np.any(data["length"].values > actions.shape[1]):
+        raise ValueError(f"expected at most {actions.shape[1]} steps, got {data['length'].values.max()}")
     return tuple(
         Trajectory(
             states[i, : length + 1], actions[i, :length], rewards[i, :length], bool(data["terminated"].values[i])

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import rollouts
-from bayespbrl.envs.opening import AnyEnvironment, from_plain, to_plain
+from bayespbrl.envs.opening import AnyEnvironment, from_plain, imported_by_name, to_plain
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
@@ -54,17 +54,22 @@ def resume(
     policy: Policy | None = None,
     schedule: Schedule | None = None,
     query: QueryRule | None = None,
+    import_package: bool = False,
 ) -> Learner:
     """The learner of a run directory after its last complete event; it keeps further events there.
 
     Args:
       directory: of a run that was stopped, killed or finished.
       env, features, policy, schedule, query: the objects that the run was started with, where these were your own.
+      import_package: whether a package that the environment's name has, as "package:Env-v0", may be imported. The run
+        may be a stranger's, and importing runs code.
 
     Raises:
-      ValueError: a directory that is no run, or a file in it that is truncated or foreign.
+      ValueError: a package that may not be imported; a directory that is no run, or a file in it that is truncated
+        or foreign.
     """
     log = RunDirectory.open(directory)
+    _check_import(log, env, import_package)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
     log.drop_partial_line()
     log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
@@ -79,17 +84,27 @@ def load(
     policy: Policy | None = None,
     schedule: Schedule | None = None,
     query: QueryRule | None = None,
+    import_package: bool = False,
 ) -> "Run":
     """A run, finished or in progress, read without changing it. Arguments and errors as of `resume`.
 
     A schedule and a query rule of your own are needed only to continue a run, not to read it.
     """
     log = RunDirectory.open(directory)
+    _check_import(log, env, import_package)
     if log.settings.update.schedule == "other" and schedule is None:
         schedule = ConstantBound()
     if log.settings.questions.query == "other" and query is None:
         query = highest_utility
     return Run(log.path, _restored(log, env, features=features, policy=policy, schedule=schedule, query=query))
+
+
+def _check_import(log: RunDirectory, env: AnyEnvironment | None, permitted: bool) -> None:
+    if env is None and not permitted and (package := imported_by_name(log.settings.env)):
+        raise ValueError(
+            f"{log.path}: the environment {log.settings.env} needs the package {package!r}, which is not imported "
+            "unless you say so: import_package=True, or --import-package on the command line"
+        )
 
 
 def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Learner:

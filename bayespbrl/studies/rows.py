@@ -153,7 +153,7 @@ def run_trial(row: Row, seed: int) -> bool:
     path = row.path(seed)
     if (known := row.outcome(seed)) is not None:
         return known
-    learner = runs.resume(path) if path.exists() else runs.start(row.env, path, **row.options, seed=seed)
+    learner = runs.resume(path, env=row.env) if path.exists() else runs.start(row.env, path, **row.options, seed=seed)
     if row.untrained:
         measure_first_policy(learner, path)
         return True

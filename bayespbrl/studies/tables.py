@@ -12,8 +12,8 @@ import xarray as xr
 from bayespbrl import rollouts
 from bayespbrl.envs import bicycle
 from bayespbrl.learner import Learner
-from bayespbrl.runs.directory import read_summary
-from bayespbrl.runs.files import write_file, written_aside
+from bayespbrl.runs.directory import read_complete_summary
+from bayespbrl.runs.files import write_file, write_netcdf, written_aside
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value", "value_newest")
 
@@ -28,7 +28,7 @@ def collect(directories: Sequence[Path | str]) -> xr.Dataset:
     Numbers are kept, and lists of numbers with a dimension of their own. Those of a nested entry have both names, as
     `seconds_utility`. Missing numbers are NaN.
     """
-    summaries = [read_summary(path) for path in directories]
+    summaries = [read_complete_summary(path) for path in directories]
     seeds = [summary["seed"] for summary in summaries]
     length = max(len(summary["iterations"]) for summary in summaries)
     iterations = list(range(1, length + 1))
@@ -146,5 +146,4 @@ def write_tables(table: xr.Dataset, directory: Path) -> None:
         rows["balancing_seconds"] = [round(number * bicycle.STEP_SECONDS, 6) for number in rows["balancing_steps"]]
     with written_aside(directory / "trials.csv") as aside:
         rows.to_csv(aside, index=False, lineterminator="\r\n")
-    with written_aside(directory / "trials.nc") as aside:
-        table.to_netcdf(aside, engine="h5netcdf")
+    write_netcdf(directory / "trials.nc", table)

@@ -18,7 +18,7 @@ from bayespbrl.diagnostics.estimates import first_preferred_probability, number_
 from bayespbrl.diagnostics.predictions import fitted_model
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
-from bayespbrl.envs.opening import environment_attribute, open_environment
+from bayespbrl.envs.opening import check_of_space, environment_attribute, imported_by_name, open_environment
 from bayespbrl.features import StateFeatures, checked_features
 from bayespbrl.models import PreferenceModel
 from bayespbrl.preferences import PastQuestion, Preferences
@@ -105,13 +105,18 @@ class RunContents:
 
 
 def read_contents(
-    directory: Path | str, *, env: gymnasium.Env | FuncEnv | None = None, features: StateFeatures | None = None
+    directory: Path | str,
+    *,
+    env: gymnasium.Env | FuncEnv | None = None,
+    features: StateFeatures | None = None,
+    import_package: bool = False,
 ) -> RunContents:
     """Read all that can be read of a run directory, and change nothing.
 
     Args:
       directory: of a run, finished or not, complete or not.
       env, features: the objects that the run was started with, where these were your own.
+      import_package: whether the package that the environment's name has may be imported.
 
     Raises:
       ValueError: a directory that is no run, or one of a newer version.
@@ -129,7 +134,7 @@ def read_contents(
         open_question=None if log.state.query is None else log.state.query.number,
         damage=log.damage,
     )
-    contents = _with_environment(contents, env)
+    contents = _with_environment(contents, env, import_package)
     if features is None and run.settings.features.features == "other":
         features, contents = _not_passed, replace(contents, features_missing="it was not passed again")
     collected = len(log.state.trajectories) // run.settings.rollouts.trajectories_per_iteration
@@ -147,12 +152,12 @@ def _with_iteration(contents: RunContents, iteration: int, file: Path, features:
     parts: dict[str, Any] = {}
     try:
         names = ("trajectories", "estimate") if iteration <= len(contents.iterations) else ("trajectories",)
-        parts = read_parts(file, names, features=features)
+        parts = _fitting_parts(contents, file, names, features)
     except ValueError as error:
         remedy = "Restore this file from a copy: its contents are missing here, and the run cannot continue."
         contents = _damaged(contents, f"Missing data: iterations/{error}.", remedy)
         with suppress(ValueError):  # only the estimate may be unreadable
-            parts = read_parts(file, ("trajectories",))
+            parts = _fitting_parts(contents, file, ("trajectories",), None)
     if not parts:
         return contents
     first = (iteration - 1) * contents.settings.rollouts.trajectories_per_iteration
@@ -166,6 +171,42 @@ def _with_iteration(contents: RunContents, iteration: int, file: Path, features:
         missing = contents.features_missing or _features_failure(contents, features, parts["trajectories"][0])
         contents = replace(contents, features_missing=missing)
     return contents
+
+
+def _fitting_parts(
+    contents: RunContents, file: Path, names: tuple[str, ...], features: StateFeatures | None
+) -> dict[str, Any]:
+    """Parts of an iteration's file, where they fit the run; `ValueError` with the file's name else."""
+    parts = read_parts(file, names, features=features)
+    try:
+        _check_fitting(contents, parts)
+    except ValueError as error:
+        raise ValueError(f"{file.name}: {error}") from error
+    return parts
+
+
+def _check_fitting(contents: RunContents, parts: Mapping[str, Any]) -> None:
+    """That trajectories are of the run's environment, and that the estimate is one of such trajectories.
+
+    Raises:
+      ValueError: they are not; the file may be a stranger's, or damaged.
+    """
+    trajectories = parts["trajectories"]
+    number = contents.settings.rollouts.trajectories_per_iteration
+    if len(trajectories) != number:
+        raise ValueError(f"{number} trajectories were expected, and {len(trajectories)} are there")
+    if contents.environment is not None:
+        for trajectory in trajectories:
+            check_of_space("states", trajectory.states, contents.environment.observation_space)
+            check_of_space("actions", trajectory.actions, contents.environment.action_space)
+    if (estimate := parts.get("estimate")) is None or contents.features_missing:
+        return
+    try:
+        estimate.trajectory_utilities(trajectories[:1])
+        if estimate.posterior is not None:
+            estimate.trajectory_draws(trajectories[:1], number=2)
+    except Exception as error:  # of damaged arrays, anything
+        raise ValueError(f"the estimate fails ({type(error).__name__}: {' '.join(str(error).split())})") from error
 
 
 def _features_failure(contents: RunContents, features: StateFeatures | None, trajectory: Trajectory) -> str:
@@ -195,11 +236,13 @@ def _damaged(contents: RunContents, what: str, remedy: str) -> RunContents:
     return replace(contents, damage=(*contents.damage, ReportWarning(what, remedy)))
 
 
-def _with_environment(contents: RunContents, env: gymnasium.Env | FuncEnv | None) -> RunContents:
+def _with_environment(contents: RunContents, env: gymnasium.Env | FuncEnv | None, import_package: bool) -> RunContents:
     settings = contents.settings
     try:
         if env is None and settings.environment == "other":
             raise ValueError(f"{settings.env} is an object of your own: pass it to bayespbrl.load as env=")
+        if env is None and not import_package and (package := imported_by_name(settings.env)):
+            raise ValueError(f"it needs the package {package!r}, imported only with import_package or --import-package")
         return replace(contents, environment=open_environment(settings.env if env is None else env))
     except ValueError as error:
         what = f"The environment cannot be opened ({error}). What needs it is missing here."

@@ -29,6 +29,7 @@ def write_report(
     format: str = "html",
     env: gymnasium.Env | FuncEnv | None = None,
     features: StateFeatures | None = None,
+    import_package: bool = False,
 ) -> Path:
     """Write the report of a run into its directory, without changing anything else there.
 
@@ -38,6 +39,7 @@ def write_report(
         `report_files/`.
       env, features: the objects that the run was started with, where these were your own. Without them the report
         leaves out what needs them, and says so.
+      import_package: whether the package that the environment's name has may be imported (`bayespbrl.resume`).
 
     Returns:
       the path of the file.
@@ -46,7 +48,7 @@ def write_report(
       ValueError: an unknown format; a directory that is no run, is one of a newer version, or cannot be written.
     """
     checks.one_of("format", format, ("html", "md"))
-    report = assembled(read_contents(directory, env=env, features=features))
+    report = assembled(read_contents(directory, env=env, features=features, import_package=import_package))
     path = Path(directory) / f"report.{format}"
     try:
         if format == "md":
