@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import subprocess
 import sys
 
@@ -27,14 +26,14 @@ PACKAGE = "raise SystemExit('this was imported')"
 def test_a_file_size_limit_ends_in_one_line_and_the_run_goes_on(tmp_path):
     out = tmp_path / "run"
     options = ["--preset", "paper", "--utility", "linear-program", "--iterations", "2", "--max-steps", "30"]
-    command = [sys.executable, "-m", "bayespbrl", "run", "gridworld", *options, "--out", str(out)]
-
-    def limited():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (16_000, 16_000))  # an iteration's file is larger
-
+    limited = (  # an iteration's file is larger
+        "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (16_000, 16_000)); "
+        "from bayespbrl.cli.commands import main; main()"
+    )
+    command = [sys.executable, "-c", limited, "run", "gridworld", *options, "--out", str(out)]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     options = {"capture_output": True, "text": True, "cwd": tmp_path, "env": environment}
-    done = subprocess.run(command, check=False, preexec_fn=limited, **options)
+    done = subprocess.run(command, check=False, **options)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("bayespbrl: ")

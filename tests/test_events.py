@@ -32,7 +32,7 @@ def answered(query, answer):
 
 def summary(iteration):
     schedule = {"reason": "confidence", "signal": iteration / 8, "gain": 0.25}
-    return {"iteration": iteration, "kl_bound": iteration / 4, "schedule": schedule}
+    return {"iteration": iteration, "answers": iteration, "value": 0.5, "kl_bound": iteration / 4, "schedule": schedule}
 
 
 def improved(iteration):

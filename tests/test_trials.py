@@ -102,6 +102,7 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
         rows = [
             {
                 "iteration": i,
+                "answers": 2 * i,
                 "value": i + seed,
                 "scale": None if i == 1 else 0.5,
                 "spread": [i, 10.0 * seed],
@@ -115,7 +116,7 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
         (tmp_path / str(seed)).mkdir()
         (tmp_path / str(seed) / "summary.json").write_text(json.dumps(summary))
     table = collect([tmp_path / "1", tmp_path / "2"])
-    assert set(table.data_vars) == {"value", "scale", "spread", "seconds_utility", "chosen_multiples"}
+    assert set(table.data_vars) == {"answers", "value", "scale", "spread", "seconds_utility", "chosen_multiples"}
     np.testing.assert_allclose(table["seconds_utility"], 2 * [[0.1, 0.2, 0.3]])
     assert table["chosen_multiples"].sel(seed=1, iteration=3).values.tolist() == [1, 2, 3]
     assert table["chosen_multiples"].sel(seed=1, iteration=1).isnull().all()
@@ -127,7 +128,10 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
 
 def test_a_run_that_ends_earlier_keeps_its_last_figures(tmp_path):
     for seed, length in ((1, 3), (2, 1)):
-        rows = [{"iteration": i, "value": 10.0 * seed + i, "seconds": {"utility": 1.0}} for i in range(1, length + 1)]
+        rows = [
+            {"iteration": i, "answers": i, "value": 10.0 * seed + i, "seconds": {"utility": 1.0}}
+            for i in range(1, length + 1)
+        ]
         summary = {"env": "e", "utility": "u", "seed": seed, "finished": True, "iterations": rows}
         (tmp_path / str(seed)).mkdir()
         (tmp_path / str(seed) / "summary.json").write_text(json.dumps(summary))

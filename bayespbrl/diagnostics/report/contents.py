@@ -168,7 +168,7 @@ def _with_iteration(contents: RunContents, iteration: int, file: Path, features:
         contents = replace(contents, answers=tuple(answers))
     if "estimate" in parts:
         contents = replace(contents, estimate=parts["estimate"], estimate_iteration=iteration)
-        missing = contents.features_missing or _features_failure(contents, features, parts["trajectories"][0])
+        missing = contents.features_missing or _features_failure(contents.estimate, features, parts["trajectories"][0])
         contents = replace(contents, features_missing=missing)
     return contents
 
@@ -179,13 +179,13 @@ def _fitting_parts(
     """Parts of an iteration's file, where they fit the run; `ValueError` with the file's name else."""
     parts = read_parts(file, names, features=features)
     try:
-        _check_fitting(contents, parts)
+        _check_fitting(contents, parts, features)
     except ValueError as error:
         raise ValueError(f"{file.name}: {error}") from error
     return parts
 
 
-def _check_fitting(contents: RunContents, parts: Mapping[str, Any]) -> None:
+def _check_fitting(contents: RunContents, parts: Mapping[str, Any], features: StateFeatures | None) -> None:
     """That trajectories are of the run's environment, and that the estimate is one of such trajectories.
 
     Raises:
@@ -201,6 +201,8 @@ def _check_fitting(contents: RunContents, parts: Mapping[str, Any]) -> None:
             check_of_space("actions", trajectory.actions, contents.environment.action_space)
     if (estimate := parts.get("estimate")) is None or contents.features_missing:
         return
+    if _features_failure(estimate, features, trajectories[0]):
+        return  # said of the features, not of the file
     try:
         estimate.trajectory_utilities(trajectories[:1])
         if estimate.posterior is not None:
@@ -209,15 +211,15 @@ def _check_fitting(contents: RunContents, parts: Mapping[str, Any]) -> None:
         raise ValueError(f"the estimate fails ({type(error).__name__}: {' '.join(str(error).split())})") from error
 
 
-def _features_failure(contents: RunContents, features: StateFeatures | None, trajectory: Trajectory) -> str:
+def _features_failure(estimate: Any, features: StateFeatures | None, trajectory: Trajectory) -> str:
     """What is wrong with features that were passed; empty if nothing."""
-    if features is None or not of_states(contents.estimate):
+    if features is None or not of_states(estimate):
         return ""
     try:
         width = checked_features(features, trajectory.states).shape[1]
     except Exception as error:  # a function of the user's may raise anything
         return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
-    expected = number_of_features(contents.estimate)
+    expected = number_of_features(estimate)
     return "" if width == expected else f"the one that was passed has {width} features, the run's {expected}"
 
 
