@@ -200,8 +200,9 @@ def test_a_row_of_an_answer_is_the_preferred_less_the_other_with_its_side():
 
 
 @pytest.mark.slow
-def test_the_study_of_simulated_people_goes_on_where_it_was_cut(tmp_path, capsys):
+def test_the_study_of_simulated_people_goes_on_where_it_was_cut(tmp_path, capsys, monkeypatch):
     study, file = benchmark("simulated_people"), tmp_path / "rows.csv"
+    monkeypatch.setattr(study, "ANSWERS", 10)
     (first,) = study.run([5], file)
     with file.open("a") as rows:
         rows.write("6,0.0,0.1")  # killed while it wrote

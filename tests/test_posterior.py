@@ -276,9 +276,7 @@ def test_forty_iterations_compile_the_sampler_at_most_five_times():
     ("number", "dimension", "scale", "steepness"),
     [
         (1, 4, 0.2, 20.0),
-        (3, 2, 1.0, 5.0),
         (8, 20, 3.0, 0.7),
-        (12, 6, 0.2, 50.0),
         (26, 25, 1.0, 5.0),
         (41, 100, 5.0, 0.5),
     ],
