@@ -156,5 +156,17 @@ def test_a_tie_pulls_the_margin_to_zero():
     assert fit.covariance[0, 0] < 0.05
 
 
+@pytest.mark.parametrize("steepness", [0.5, 5.0, 20.0])
+def test_a_tie_far_from_zero_has_finite_moments_that_mirror_each_other(steepness):
+    tie = WithTies(Mixed(steepness, 5.0), 0.1, np.array([True])).probit_mixture()
+    for mean in (0.3, 1.0, 3.0, 10.0, 100.0, 1000.0):
+        above, below = (tilted_moments(np.array([sign * mean]), np.array([0.01]), tie) for sign in (1, -1))
+        np.testing.assert_allclose(above[0], below[0], rtol=1e-6)
+        np.testing.assert_allclose(above[1], -below[1], rtol=1e-6)
+        np.testing.assert_allclose(above[2], below[2], rtol=1e-6)
+        assert 0 <= above[1][0] <= mean + 1e-9
+        assert 0 < above[2][0] < 0.02
+
+
 def _tie(steepness, threshold, t):
     return 1 / (1 + np.exp(-steepness * (t + threshold))) - 1 / (1 + np.exp(-steepness * (t - threshold)))

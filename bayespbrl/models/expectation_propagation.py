@@ -25,6 +25,7 @@ TOLERANCE = 1e-6  # change of the margins' moments, in standard deviations, that
 # sites grow by a factor at every sweep, until the linear algebra breaks down near 1e16.
 RUNAWAY = 1e12
 SAME = 1e-10  # of the cosine between two rows of L, below 1, where they are about the same margin
+LOST = 1e-11  # of a tie's probability, over its two terms: less is rounding
 # Panels on which one factor of several answers is integrated: to where the Gaussian ends, in its standard deviations,
 # and narrower ones towards the offsets.
 WIDE, GROWTH = np.linspace(-12, 12, 49), 1.5
@@ -81,14 +82,20 @@ def tilted_moments(
     spread = np.sqrt(variances[:, None] + mixture.scales**2)
     x = (means[:, None] - mixture.offsets) / spread
     weights = np.broadcast_to(mixture.weights, x.shape)
+    # a tie is a difference of two terms, precise in the lower tail: Σⱼ aⱼ = 0, so that Z = −Σⱼ aⱼ Φ(−xⱼ) as well
+    upper = (np.abs(np.sum(weights, axis=1)) < 1e-12) & (means > 0)
+    sign = np.where(upper, -1.0, 1.0)[:, None]
     # terms relative to the largest keep their precision where all of Z is tiny
-    log_cdf = log_ndtr(x)
+    log_cdf = log_ndtr(sign * x)
     top = np.max(np.where(weights != 0, log_cdf, -np.inf), axis=1, keepdims=True)
     constant = mixture.constant * np.exp(np.minimum(-top[:, 0], 700))
     density = weights * np.exp(-0.5 * x**2 - 0.5 * np.log(2 * np.pi) - top) / spread
-    z = np.maximum(constant + np.sum(weights * np.exp(log_cdf - top), axis=1), np.finfo(float).tiny)
-    slope = np.sum(density, axis=1) / z
-    curvature = np.sum(-density * x / spread, axis=1) / z - slope**2
+    terms = sign * weights * np.exp(log_cdf - top)
+    z = np.maximum(constant + np.sum(terms, axis=1), np.finfo(float).tiny)
+    # where nothing is left of a tie but rounding, it has no direction either
+    lost = z <= LOST * (constant + np.sum(np.abs(terms), axis=1))
+    slope = np.where(lost, 0, np.sum(density, axis=1)) / z
+    curvature = np.where(lost, 0, np.sum(-density * x / spread, axis=1)) / z - slope**2
     tilted_variance = variances + variances**2 * curvature
     return top[:, 0] + np.log(z), means + variances * slope, np.maximum(tilted_variance, 1e-12 * variances)
 
