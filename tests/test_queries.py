@@ -296,6 +296,15 @@ def test_nothing_is_asked_once_the_budget_is_spent():
     assert later_questions(QUERY_RULES["information"], given, several, answers=1).wanted == 2
 
 
+@pytest.mark.parametrize(("signal", "sure"), [(0.49, False), (0.51, True)])
+def test_an_iteration_asks_nothing_from_a_signal_of_one_half_on(signal, sure):
+    estimate = SimpleNamespace(quality=SimpleNamespace(converged=True))
+    options, preferences = Questions(unasked_iterations=4), Preferences(((0, 1),), (0,), 8)
+    assert options.skips(preferences, 0, estimate, signal) == sure
+    estimate.quality.converged = False
+    assert not options.skips(preferences, 0, estimate, signal)
+
+
 def test_three_lines_make_a_rule_of_ones_own():
     def newest(situation):
         return sorted(situation.new, reverse=True)
