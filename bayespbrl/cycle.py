@@ -33,6 +33,7 @@ from bayespbrl.utility.inference import estimate
 COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT, CLIPS = range(11)
 # Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
+HOLDS = 40  # of exploration, in an episode
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Cycle:
             key=self._key(COLLECT, state.iteration),
             episodes=options.trajectories_per_iteration,
             max_steps=options.max_steps,
-            hold=options.exploration_hold,
+            hold=self._hold(state),
             starts=self._starts(state.iteration) if asking.same_start else None,
         )
         clips = asking.clips(collected, rng=self._rng(CLIPS, state.iteration))
@@ -89,6 +90,16 @@ class Cycle:
             "seconds": time.perf_counter() - began,
         }
         return _entry(event, trajectories=collected)
+
+    def _hold(self, state: LearnerState) -> int:
+        """For how many steps exploration is held: as set, or a share of an episode."""
+        options = self.settings.rollouts
+        if options.exploration_hold is not None:
+            return options.exploration_hold
+        first = state.trajectories[: options.trajectories_per_iteration]
+        limit = rollouts.step_limit(self.environment, options.max_steps)
+        length = np.mean([len(each) for each in first]) if first else limit
+        return max(1, round(float(length) / HOLDS))
 
     def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> questions.Chosen:
         options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)

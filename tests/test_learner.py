@@ -5,6 +5,7 @@ import itertools
 import json
 from dataclasses import replace
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -699,3 +700,28 @@ def test_exploration_is_held_for_as_many_steps_as_the_settings_say(monkeypatch):
     )
     learner(iterations=2, exploration_hold=4).run(ReturnExpert())
     assert held == [4, 4]
+
+
+def test_exploration_is_held_for_a_share_of_the_first_episodes_where_they_end_early(monkeypatch):
+    held, rollout = [], rollouts.rollout
+    monkeypatch.setattr(
+        rollouts, "rollout", lambda *a, **options: held.append(options["hold"]) or rollout(*a, **options)
+    )
+
+    class Falls(gymnasium.Env):
+        """Ends by itself after 80 of at most 400 steps."""
+
+        observation_space, action_space = gymnasium.spaces.Box(-1, 1, (1,)), gymnasium.spaces.Box(-1, 1, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.steps = 0
+            return np.zeros(1), {}
+
+        def step(self, action):
+            self.steps += 1
+            return np.clip(action, -1, 1).astype(float), float(action[0]), self.steps == 80, False, {}
+
+    options = {"centres": 10, "evaluation_episodes": 2, "trajectories_per_iteration": 3, "seed": 1}
+    Learner(gymnasium.wrappers.TimeLimit(Falls(), 400), iterations=2, **options).run(ReturnExpert())
+    assert held == [10, 2]

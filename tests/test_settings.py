@@ -42,7 +42,7 @@ BAD = {
     "recent_iterations": [0, -4, True, 2.0],
     "updates_per_iteration": [0, -1, True, 1.5, None],
     "unasked_iterations": [-1, True, 1.5, None],
-    "exploration_hold": [0, -1, True, 2.0, None],
+    "exploration_hold": [0, -1, True, 2.0],
     "schedule": ["bold", None],
     "hyperparameters": ["chosen", None],
     "utility_bandwidth_factor": [0, -1.0, NAN],
@@ -142,9 +142,9 @@ def test_the_default_derives_from_spaces_and_horizon_what_tasks_differ_in():
         settings = settings_for("SomebodysEnv-v3", task=task)
         return settings.critic.discount, settings.rollouts.exploration_hold, settings.features.bandwidth_factor
 
-    assert derived(TASK) == (0.98, 5, 0.5)
+    assert derived(TASK) == (0.98, None, 0.5)
     assert derived(Task(Box(-1.0, 1.0, (4,)), Discrete(2), horizon=500)) == (0.992, 1, 1.0)
-    assert derived(Task(Box(-1.0, 1.0, (17,)), Box(-1.0, 1.0, (6,)), horizon=1000)) == (0.995, 25, 2.0)
+    assert derived(Task(Box(-1.0, 1.0, (17,)), Box(-1.0, 1.0, (6,)), horizon=1000)) == (0.995, None, 2.0)
     assert settings_for("SomebodysEnv-v3", task=TASK, discount=0.9).critic.discount == 0.9
 
 

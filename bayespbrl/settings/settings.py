@@ -71,7 +71,8 @@ class Rollouts:
       trajectories_per_iteration: N.
       max_steps: steps an episode; None for the environment's own limit.
       exploration_hold: steps for which the exploring policy's random choice is held, so that the trajectories of an
-        iteration differ; the paper's is 1. Evaluations never hold it.
+        iteration differ; the paper's is 1. None: a fortieth of an episode, in the first iteration by the limit of
+        steps, then by the mean length of the first trajectories, which may end early. Evaluations never hold it.
       evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
       policy: the kind of policy. `auto` takes tabular for discrete states, softmax for discrete actions in continuous
         states, gaussian-process otherwise; `other` is a policy of the user's.
@@ -80,7 +81,7 @@ class Rollouts:
 
     trajectories_per_iteration: int = 10
     max_steps: int | None = None
-    exploration_hold: int = 1
+    exploration_hold: int | None = 1
     evaluation_episodes: int = 100
     policy: str = "auto"
     initial_action_scale: float = 0.75
@@ -89,7 +90,8 @@ class Rollouts:
         checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
         if self.max_steps is not None:
             checks.whole("max_steps", self.max_steps)
-        checks.whole("exploration_hold", self.exploration_hold)
+        if self.exploration_hold is not None:
+            checks.whole("exploration_hold", self.exploration_hold)
         checks.whole("evaluation_episodes", self.evaluation_episodes)
         checks.one_of("policy", self.policy, POLICIES)
         checks.positive("initial_action_scale", self.initial_action_scale)
