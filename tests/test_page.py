@@ -99,6 +99,12 @@ def press(opened, answer):
     next_turn(opened, turn)
 
 
+def settled(page):
+    """The learner of a page; the next question, or the end, is shown a moment before it is recorded."""
+    page.session.wait(timeout=120)
+    return page.session.learner
+
+
 def answers_of(page):
     """The answers in the log, those taken back among them."""
     events = map(json.loads, page.session.learner.log.log_file.read_text().splitlines())
@@ -110,12 +116,12 @@ def test_a_scripted_person_answers_a_whole_run_as_the_simulated_expert_does(brow
     with tab(browser, gridworld) as opened:
         opened.on("request", lambda request: requests.append(request.url))
         while opened.get_attribute(".bp-box", "data-phase") != "finished":
-            query = gridworld.session.learner.state.query
+            query = settled(gridworld).state.query
             press(opened, str(expert(*query.trajectories)))
         assert "4 answers" in opened.inner_text(".bp-ask")
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(expert)
     assert learner.preferences.answers == 4
-    assert fingerprint(gridworld.session.learner) == fingerprint(learner)
+    assert fingerprint(settled(gridworld)) == fingerprint(learner)
     assert requests
     assert [url for url in requests if not url.startswith(gridworld.address)] == []
 
@@ -157,9 +163,16 @@ def test_a_reload_and_a_second_tab_show_the_same_question_and_count_no_answer_tw
         opened.wait_for_selector(READY)
         other.wait_for_selector(f"{READY}[data-turn='{turn}']")
         assert turn_of(opened) == turn
-        # both answer the same question at once
+        both = []
+
+        def hold(route):  # both answer the same question before the server hears either
+            both.append(route)
+            for each in both if len(both) == 2 else ():
+                each.continue_()
+
         for each in (opened, other):
-            each.evaluate("setTimeout(() => document.querySelector('[data-answer=second]').click(), 100)")
+            each.route("**/answer", hold)
+            each.keyboard.press("ArrowRight")
         next_turn(opened, turn)
         next_turn(other, turn)
         assert answers_of(gridworld) == ["first", "second"]
