@@ -7,8 +7,9 @@ from unittest import mock
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.spaces import Box, Discrete
-from PIL import Image
+from PIL import Image, ImageDraw
 from toys import QUICK, Slope, fingerprint
 
 import bayespbrl
@@ -180,7 +181,7 @@ def clips_of(env, **options):
 
 def checked_clips(learner, query):
     drawn = Clips(learner)
-    clips = drawn.of(query)
+    clips = drawn.of(query, learner.state)
     for clip, trajectory in zip(clips, query.trajectories, strict=True):
         sheet = Image.open(io.BytesIO(clip.sheet))
         assert sheet.size == (clip.columns * clip.width, -(-clip.frames // clip.columns) * clip.height)
@@ -213,6 +214,32 @@ def test_an_environment_that_renders_is_filmed_by_itself():
     clips = clips_of(Camera())
     assert {(clip.width, clip.height, clip.frames) for clip in clips} == {(90, 60, 21)}
     assert all(clip.sheet.startswith(b"\xff\xd8") for clip in clips)  # JPEG: many colours
+
+
+class FilmedCartPole(CartPoleEnv):
+    """Gymnasium's CartPole with pictures of its own state, which need no library for games."""
+
+    def render(self):
+        picture = Image.new("RGB", (96, 64), "white")
+        x, _, angle, _ = self.state
+        foot = 48 + 18 * x, 50
+        ImageDraw.Draw(picture).line([foot, (foot[0] + 40 * np.sin(angle), 50 - 40 * np.cos(angle))], "black", 3)
+        return np.asarray(picture)
+
+
+def test_a_part_of_an_episode_is_filmed_by_an_environment_that_begins_at_the_reset():
+    env = FilmedCartPole(render_mode="rgb_array")
+    learner = bayespbrl.Learner(env, expert="other", clip_steps=6, **QUICK)
+    query = learner.ask()[0]
+    assert max(learner.state.clips[number][0] for number in (query.first, query.second)) > 0  # not at the reset
+    for clip, part in zip(checked_clips(learner, query), query.trajectories, strict=True):
+        assert (clip.width, clip.height, clip.frames) == (96, 64, 7)
+        sheet = np.asarray(Image.open(io.BytesIO(clip.sheet)).convert("L"))
+        for place, state in enumerate(part.states):
+            row, column = divmod(place, clip.columns)
+            shown = sheet[64 * row : 64 * (row + 1), 96 * column : 96 * (column + 1)]
+            env.state = state
+            np.testing.assert_array_equal(shown > 127, env.render()[:, :, 0] > 127)
 
 
 @pytest.mark.parametrize("env", [Camera(jumps=True), Camera(render_mode=None), Slope(), Many()])

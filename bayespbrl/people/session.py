@@ -200,7 +200,7 @@ class Session:
         """The clips of the question that waits, and the answers to it, the likeliest first."""
         query = state.query
         assert query is not None
-        clips = self._clips.of(query)
+        clips = self._clips.of(query, state)
         said: dict[str, Any] = {"worth": None, "sure": None, "advice": ""}
         first = 0.5
         if state.estimate is not None and state.estimate.posterior is not None:
