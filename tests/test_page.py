@@ -431,16 +431,17 @@ class Person:
 
 
 def test_a_server_that_is_killed_at_any_moment_loses_no_answer_and_counts_none_twice(tmp_path):
-    options = QUICK | {"iterations": 12}
+    iterations = 6 * KILLS
+    options = QUICK | {"iterations": iterations}
     bayespbrl.start("gridworld", tmp_path / "run", expert="page", **options)
     person, rng = Person(tmp_path / "run"), random.Random(0)
     for _ in range(KILLS):
-        person.sit(rng.uniform(0.0, 0.6))
+        assert not person.sit(rng.uniform(0.0, 0.6))
     while not person.sit(None):
         time.sleep(0.1)
     events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     answered = [event for event in events if event["event"] == "answered"]
-    assert [event["query"] for event in answered] == list(range(1, 14))
+    assert [event["query"] for event in answered] == list(range(1, iterations + 2))
     kept = list(enumerate(event["answer"] for event in answered))
     assert set(person.acknowledged) <= set(kept)
     assert len(person.acknowledged) == len(set(person.acknowledged)) >= len(kept) - KILLS

@@ -17,11 +17,12 @@ from bayespbrl.cli.commands import main
 from bayespbrl.events import LearnerState
 from bayespbrl.people.clips import MOST_BYTES, Clips
 from bayespbrl.people.drawing import SCENES
+from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
 from bayespbrl.people.session import FINISHED, QUESTION, Session, Stale, answer_of
 from bayespbrl.people.widget import ComparisonWidget
-from bayespbrl.preferences import Query
+from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.lock import continuing
 from bayespbrl.trajectories import Trajectory
 
@@ -67,6 +68,29 @@ def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitti
     plain = bayespbrl.Learner("gridworld", **options).run(bayespbrl.ReturnExpert(), answerer="Ada")
     assert fingerprint(session.learner) == fingerprint(plain)
     assert any(ahead)
+
+
+def test_a_tie_is_foreseen_last_until_the_run_has_one():
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    answers = tuple(map(Answer, ("second", "first", "skip", "tie")))
+    foresight = Foresight(learner.cycle, learner.state, lambda state: ("shown", answers))
+
+    def foreseen(number):
+        """The answers after which the next moments are foreseen."""
+        order = []
+        while len(order) < number and (moment := foresight.pending()) is not None:
+            entry = foresight.compute(moment)
+            if entry is not None:
+                foresight.keep(moment, entry)
+            if moment.complete:
+                after = foresight.present.after.items()
+                order.append(next((str(answer) for answer, known in after if known is moment), "other"))
+        return order
+
+    assert foreseen(9) == ["other", "second", "first", "skip", *["other"] * 4, "tie"]
+    present = foresight.move(Answer.TIE, foresight.present.after[Answer.TIE].state)
+    assert present.complete
+    assert foreseen(4) == ["second", "first", "skip", "tie"]
 
 
 def test_nothing_reaches_the_log_before_the_answer(sitting, tmp_path):

@@ -111,6 +111,12 @@ class Session:
         """Whether the sitting is finished, or has failed."""
         return self._view["phase"] in (FINISHED, FAILED)
 
+    @property
+    def idle(self) -> bool:
+        """Whether a person is shown something and all that may follow is computed."""
+        with self._changed:
+            return self._view["phase"] != THINKING and self._pending() is None
+
     def sheet(self, turn: int, side: int) -> bytes:
         """The sprite sheet of a clip of the question of a turn, side 0 or 1; `Stale` where the turn is over."""
         sheets = self._sheets
@@ -224,7 +230,7 @@ class Session:
     # What is shown.
 
     def _show(self, state: LearnerState) -> tuple[Shown, tuple[Answer, ...]]:
-        """The clips of the question that waits, and the answers to it, the likeliest first."""
+        """The clips of the question that waits, and the answers to it, the likeliest first and a tie last."""
         query = state.query
         assert query is not None
         if self._introduction is not None and self._introduction.clips is None:
@@ -243,7 +249,7 @@ class Session:
                     f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
                 )
         likely = (Answer.FIRST, Answer.SECOND) if first >= 0.5 else (Answer.SECOND, Answer.FIRST)
-        return Shown(clips, said), (*likely, Answer.TIE, Answer.SKIP)
+        return Shown(clips, said), (*likely, Answer.SKIP, Answer.TIE)  # after a skip there is little to compute
 
     def _described(self, phase: str, state: LearnerState | None = None) -> dict[str, Any]:
         state, settings = state or self.learner.state, self.learner.settings
