@@ -230,9 +230,9 @@ function render({ model, el }) {
     find(".bp-who").textContent = `Your answers are kept ${kept}. All windows of this page show the same question and count as one person.`;
     find(".bp-learner").textContent = "";
     if (view.turn !== answered) lock(false);
-    box.dataset.turn = view.turn;
     say("Before you start", "Before you start: read what is asked, then press Enter.");
-    focus();
+    if (box.dataset.turn !== String(view.turn)) focus(); // a view of the same turn leaves it on the button
+    box.dataset.turn = view.turn;
   }
 
   function focus() {

@@ -294,7 +294,7 @@ class Session:
             self._set(self._described(FINISHED, state) | {"say": self._ending(state)})
             return
         notice = ""
-        if given and given % BREAK == 0:
+        if given > 0 and given % BREAK == 0:
             notice = f"You have given {given} answers. Pause when you like; nothing is lost."
         elif not given and self._introduction is not None:
             notice = "The practice is over. From now on your answers are kept."
