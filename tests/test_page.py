@@ -431,7 +431,7 @@ class Person:
 
 
 def test_a_server_that_is_killed_at_any_moment_loses_no_answer_and_counts_none_twice(tmp_path):
-    iterations = 6 * KILLS
+    iterations = max(12, 4 * KILLS)
     options = QUICK | {"iterations": iterations}
     bayespbrl.start("gridworld", tmp_path / "run", expert="page", **options)
     person, rng = Person(tmp_path / "run"), random.Random(0)
