@@ -70,15 +70,15 @@ def gridworld(tmp_path):
 
 
 @contextmanager
-def tab(browser, page, **options):
-    """A tab of the browser in a context of its own, which shows a question."""
+def tab(browser, page, ready=READY, **options):
+    """A tab of the browser in a context of its own, which shows a question, or what `ready` selects."""
     context = browser.new_context(**options)
     context.set_default_timeout(120_000)  # milliseconds; machines may be busy
     try:
         opened = context.new_page()
         opened.on("pageerror", lambda error: pytest.fail(f"JavaScript: {error}"))
         opened.goto(page.address)
-        opened.wait_for_selector(READY)
+        opened.wait_for_selector(ready)
         yield opened
     finally:
         context.close()
@@ -90,13 +90,28 @@ def turn_of(opened):
 
 def next_turn(opened, turn):
     """Wait for the question after a turn, or for the end."""
-    opened.wait_for_selector(f"{READY}:not([data-turn='{turn}']), .bp-box[data-phase=finished]")
+    shown = ".bp-box:is([data-phase=question], [data-phase=instructions])[data-locked=false]"
+    opened.wait_for_selector(f"{shown}:not([data-turn='{turn}']), .bp-box[data-phase=finished]")
+
+
+def until(opened, condition):
+    """Wait, while the browser goes on, until a condition holds."""
+    late = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < late
+        opened.wait_for_timeout(20)
 
 
 def press(opened, answer):
     turn = turn_of(opened)
     opened.keyboard.press(KEYS[answer])
     next_turn(opened, turn)
+
+
+def settled(page):
+    """The learner of a page; the next question, or the end, is shown a moment before it is recorded."""
+    page.session.wait(timeout=120)
+    return page.session.learner
 
 
 def answers_of(page):
@@ -110,12 +125,12 @@ def test_a_scripted_person_answers_a_whole_run_as_the_simulated_expert_does(brow
     with tab(browser, gridworld) as opened:
         opened.on("request", lambda request: requests.append(request.url))
         while opened.get_attribute(".bp-box", "data-phase") != "finished":
-            query = gridworld.session.learner.state.query
+            query = settled(gridworld).state.query
             press(opened, str(expert(*query.trajectories)))
         assert "4 answers" in opened.inner_text(".bp-ask")
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(expert)
     assert learner.preferences.answers == 4
-    assert fingerprint(gridworld.session.learner) == fingerprint(learner)
+    assert fingerprint(settled(gridworld)) == fingerprint(learner)
     assert requests
     assert [url for url in requests if not url.startswith(gridworld.address)] == []
 
@@ -157,32 +172,43 @@ def test_a_reload_and_a_second_tab_show_the_same_question_and_count_no_answer_tw
         opened.wait_for_selector(READY)
         other.wait_for_selector(f"{READY}[data-turn='{turn}']")
         assert turn_of(opened) == turn
-        # both answer the same question at once
+        both = []
+
+        def hold(route):  # both answer the same question before the server hears either
+            both.append(route)
+            for each in both if len(both) == 2 else ():
+                each.continue_()
+
         for each in (opened, other):
-            each.evaluate("setTimeout(() => document.querySelector('[data-answer=second]').click(), 100)")
+            each.route("**/answer", hold)
+            each.keyboard.press("ArrowRight")
         next_turn(opened, turn)
         next_turn(other, turn)
         assert answers_of(gridworld) == ["first", "second"]
+        notes = [each.locator(".bp-note") for each in (opened, other)]
+        until(opened, lambda: sum("another window" in note.inner_text() for note in notes) == 1)
 
 
 @pytest.mark.parametrize("heard", [False, True])
 def test_an_answer_whose_connection_is_lost_is_sent_again_and_counts_once(browser, gridworld, heard):
     """The request is lost, or (`heard`) its reply."""
-    lost = []
+    posts = []
 
     def lose(route):
-        if lost:
+        posts.append(route.request.post_data)
+        if len(posts) > 1:
             return route.continue_()
         if heard:
             route.fetch()
-        lost.append(route.request.post_data)
         return route.abort()
 
     with tab(browser, gridworld) as opened:
         opened.route("**/answer", lose)
         press(opened, "second")
         opened.wait_for_selector(READY)
-        assert len(lost) == 1
+        until(opened, lambda: len(posts) == 2)  # the next question may come before the reply is missed
+        opened.wait_for_selector(".bp-note", state="hidden")
+        assert posts[0] == posts[1]
         assert answers_of(gridworld) == ["second"]
 
 
@@ -228,9 +254,55 @@ def test_it_can_be_used_with_reduced_motion_on_a_phone_and_by_a_screen_reader(br
         )
         assert all(names)
         targets = opened.evaluate(
-            "[...document.querySelectorAll('button')].map((b) => b.getBoundingClientRect().height)"
+            "[...document.querySelectorAll('button')].filter((b) => b.checkVisibility())"
+            ".map((b) => b.getBoundingClientRect().height)"
         )
+        assert len(targets) == len(names) - 1  # but for that of the instructions
         assert min(targets) >= 44
+
+
+def test_a_new_person_gets_instructions_and_practises_by_keyboard_alone(browser, tmp_path):
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
+    instructions = ".bp-box[data-phase=instructions][data-locked=false]"
+    with (
+        served(learner, answerer="Ada", practice=True) as page,
+        tab(browser, page, ready=instructions, viewport={"width": 360, "height": 700}) as opened,
+    ):
+        live, ask, quiet = ".bp-live", ".bp-ask", ".bp-learner"
+        assert "press Enter" in opened.inner_text(live)
+        text = opened.inner_text(".bp-intro")
+        for said in (
+            "under the name Ada",
+            "count as one person",
+            "Cannot tell",
+            "Undo",
+            "Practice answers are not kept",
+        ):
+            assert said in text
+        assert opened.evaluate("document.documentElement.scrollWidth") <= 360
+        assert opened.get_by_role("button").all_inner_texts() == ["Start the practice"]
+        opened.keyboard.press("ArrowLeft")  # answers nothing here
+        opened.keyboard.press("Enter")
+        opened.wait_for_selector(READY)
+        turn = turn_of(opened)
+        assert "Practice 1 of 2: which one is better?" in opened.inner_text(ask)
+        assert "your answer is not kept" in opened.inner_text(live)
+        press(opened, "undo")  # back to the instructions
+        opened.reload()
+        opened.wait_for_selector(instructions)
+        opened.keyboard.press("Enter")
+        opened.wait_for_selector(READY)
+        assert turn_of(opened) == turn + 2
+        press(opened, "first")
+        assert "Practice 2 of 2: which one is better?" in opened.inner_text(live)
+        assert "your answer is not kept" in opened.inner_text(quiet)
+        press(opened, "tie")
+        assert opened.inner_text(ask) == "Which one is better?"
+        assert "The practice is over" in opened.inner_text(quiet)
+        assert answers_of(page) == []
+        press(opened, "second")
+        assert answers_of(page) == ["second"]
+        assert "answered by Ada" in opened.inner_text(".bp-task")
 
 
 def call(page, method, path, body=None, **headers):
@@ -318,7 +390,7 @@ class Person:
 
         Returns whether the run is finished.
         """
-        command = [sys.executable, "-m", "bayespbrl", "ask", str(self.directory)]
+        command = [sys.executable, "-m", "bayespbrl", "ask", str(self.directory), "--no-practice"]
         server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         try:
             lines = iter(server.stdout.readline, "")
@@ -359,16 +431,17 @@ class Person:
 
 
 def test_a_server_that_is_killed_at_any_moment_loses_no_answer_and_counts_none_twice(tmp_path):
-    options = QUICK | {"iterations": 12}
+    iterations = max(12, 4 * KILLS)
+    options = QUICK | {"iterations": iterations}
     bayespbrl.start("gridworld", tmp_path / "run", expert="page", **options)
     person, rng = Person(tmp_path / "run"), random.Random(0)
     for _ in range(KILLS):
-        person.sit(rng.uniform(0.0, 0.6))
+        assert not person.sit(rng.uniform(0.0, 0.6))
     while not person.sit(None):
         time.sleep(0.1)
     events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     answered = [event for event in events if event["event"] == "answered"]
-    assert [event["query"] for event in answered] == list(range(1, 14))
+    assert [event["query"] for event in answered] == list(range(1, iterations + 2))
     kept = list(enumerate(event["answer"] for event in answered))
     assert set(person.acknowledged) <= set(kept)
     assert len(person.acknowledged) == len(set(person.acknowledged)) >= len(kept) - KILLS

@@ -7,18 +7,22 @@ from unittest import mock
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.spaces import Box, Discrete
-from PIL import Image
+from PIL import Image, ImageDraw
 from toys import QUICK, Slope, fingerprint
 
 import bayespbrl
 from bayespbrl.cli.commands import main
+from bayespbrl.events import LearnerState
 from bayespbrl.people.clips import MOST_BYTES, Clips
 from bayespbrl.people.drawing import SCENES
+from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.plots import observation_names
+from bayespbrl.people.practice import practice_queries
 from bayespbrl.people.session import FINISHED, QUESTION, Session, Stale, answer_of
 from bayespbrl.people.widget import ComparisonWidget
-from bayespbrl.preferences import Query
+from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.lock import continuing
 from bayespbrl.trajectories import Trajectory
 
@@ -66,6 +70,29 @@ def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitti
     assert any(ahead)
 
 
+def test_a_tie_is_foreseen_last_until_the_run_has_one():
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    answers = tuple(map(Answer, ("second", "first", "skip", "tie")))
+    foresight = Foresight(learner.cycle, learner.state, lambda state: ("shown", answers))
+
+    def foreseen(number):
+        """The answers after which the next moments are foreseen."""
+        order = []
+        while len(order) < number and (moment := foresight.pending()) is not None:
+            entry = foresight.compute(moment)
+            if entry is not None:
+                foresight.keep(moment, entry)
+            if moment.complete:
+                after = foresight.present.after.items()
+                order.append(next((str(answer) for answer, known in after if known is moment), "other"))
+        return order
+
+    assert foreseen(9) == ["other", "second", "first", "skip", *["other"] * 4, "tie"]
+    present = foresight.move(Answer.TIE, foresight.present.after[Answer.TIE].state)
+    assert present.complete
+    assert foreseen(4) == ["second", "first", "skip", "tie"]
+
+
 def test_nothing_reaches_the_log_before_the_answer(sitting, tmp_path):
     learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
     session = sitting(learner)
@@ -103,6 +130,95 @@ def test_a_sitting_ends_after_its_answers_and_the_run_goes_on(sitting):
     assert view["answered"] == 2
     assert "2 answers of this sitting" in view["say"]
     assert learner.ask()
+
+
+def test_practice_comes_before_the_first_question_of_a_person_and_records_nothing(sitting, tmp_path):
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
+    session = sitting(learner, answerer="Ada", practice=True)
+    assert session.wait(("instructions",))["turn"] == 1
+    with pytest.raises(ValueError, match="answer: expected 'begin' to the instructions, got 'first'"):
+        session.answer(1, "first")
+    seen, turns = [], []
+    for given in ("begin", "first", "undo", "skip", "tie"):
+        session.answer(session.view["turn"], given)
+        view = session.wait(timeout=WAIT)
+        seen.append(view["practice"])
+        turns.append(view["turn"])
+        assert session.sheet(view["turn"], 0).startswith(b"\x89PNG")
+    assert seen == [(1, 2), (2, 2), (1, 2), (2, 2), None]
+    assert turns == [2, 3, 4, 5, 6]
+    assert "From now on your answers are kept" in view["notice"]
+    assert not view["undo"]
+    with pytest.raises(ValueError, match="expert: expected one of"):
+        session.answer(6, "begin")
+    events = [line.split('"')[3] for line in learner.log.log_file.read_text().splitlines()]
+    assert events == ["collected", "asked"]
+    session.answer(6, "first")
+    session.close()
+    assert sitting(learner, answerer="Ada", practice=True).wait(timeout=WAIT)["phase"] == QUESTION
+
+
+def test_a_second_person_practises_too_and_takes_no_answer_of_the_first_back(sitting):
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    learner.ask()
+    learner.tell(["first"], answerer="Ada")
+    session = sitting(learner, answerer="Bob", practice=True)
+    for given in ("begin", "tie", "tie"):
+        session.answer(session.wait(("instructions", QUESTION), WAIT)["turn"], given)
+    view = session.wait(timeout=WAIT)
+    assert (view["practice"], view["answered"], view["undo"]) == (None, 1, False)
+    with pytest.raises(ValueError, match="undo: expected an answer of the same person's to take back, got none"):
+        session.answer(view["turn"], "undo")
+    session.answer(view["turn"], "tie")
+    assert session.wait(timeout=WAIT)["undo"]
+
+
+def test_practice_questions_are_about_other_trajectories_where_there_are_enough():
+    trajectories = [Trajectory(np.arange(3.0), np.zeros(2), np.zeros(2)) for _ in range(6)]
+
+    def asked(number, first, second):
+        both = (trajectories[first], trajectories[second])
+        state = LearnerState(
+            None, trajectories=tuple(trajectories[:number]), query=Query(1, first, second, second, both)
+        )
+        return [(query.first, query.second) for query in practice_queries(state)]
+
+    assert asked(6, 1, 0) == [(2, 3), (4, 5)]
+    assert asked(6, 1, 4) == [(2, 3), (0, 2)]
+    assert asked(3, 0, 2) == [(0, 1), (1, 2)]
+    assert asked(2, 0, 1) == [(0, 1)]
+
+
+def test_a_quiet_line_now_and_then_says_that_a_person_may_pause(sitting, monkeypatch):
+    monkeypatch.setattr("bayespbrl.people.session.BREAK", 2)
+    session, notices = sitting(bayespbrl.Learner("gridworld", expert="other", **QUICK)), []
+    while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
+        notices.append(view["notice"])
+        session.answer(view["turn"], "tie")
+    assert notices == ["", "", "You have given 2 answers. Pause when you like; nothing is lost.", ""]
+
+
+@pytest.mark.parametrize("command", ["run", "ask"])
+@pytest.mark.parametrize(("options", "first"), [([], True), (["--no-practice"], False)])
+def test_the_command_line_begins_with_the_practice_unless_told(
+    monkeypatch, directory, tmp_path, command, options, first
+):
+    practises = []
+
+    def look(page):
+        page.session.open()
+        practises.append(page.session.view["phase"] == "instructions")
+        page.session.close()
+        page._socket.close()
+
+    monkeypatch.setattr("bayespbrl.people.page.Page.serve", look)
+    chosen = (
+        ["ask", directory] if command == "ask" else ["run", "gridworld", "--expert", "page", "--out", tmp_path / "new"]
+    )
+    monkeypatch.setattr(sys, "argv", ["bayespbrl", *map(str, chosen), *options])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert (stop.value.code, practises) == (0, [first])
 
 
 def test_a_full_disk_ends_the_sitting_and_keeps_the_answers(sitting, tmp_path):
@@ -180,7 +296,7 @@ def clips_of(env, **options):
 
 def checked_clips(learner, query):
     drawn = Clips(learner)
-    clips = drawn.of(query)
+    clips = drawn.of(query, learner.state)
     for clip, trajectory in zip(clips, query.trajectories, strict=True):
         sheet = Image.open(io.BytesIO(clip.sheet))
         assert sheet.size == (clip.columns * clip.width, -(-clip.frames // clip.columns) * clip.height)
@@ -213,6 +329,32 @@ def test_an_environment_that_renders_is_filmed_by_itself():
     clips = clips_of(Camera())
     assert {(clip.width, clip.height, clip.frames) for clip in clips} == {(90, 60, 21)}
     assert all(clip.sheet.startswith(b"\xff\xd8") for clip in clips)  # JPEG: many colours
+
+
+class FilmedCartPole(CartPoleEnv):
+    """Gymnasium's CartPole with pictures of its own state, which need no library for games."""
+
+    def render(self):
+        picture = Image.new("RGB", (96, 64), "white")
+        x, _, angle, _ = self.state
+        foot = 48 + 18 * x, 50
+        ImageDraw.Draw(picture).line([foot, (foot[0] + 40 * np.sin(angle), 50 - 40 * np.cos(angle))], "black", 3)
+        return np.asarray(picture)
+
+
+def test_a_part_of_an_episode_is_filmed_by_an_environment_that_begins_at_the_reset():
+    env = FilmedCartPole(render_mode="rgb_array")
+    learner = bayespbrl.Learner(env, expert="other", clip_steps=6, **QUICK)
+    query = learner.ask()[0]
+    assert max(learner.state.clips[number][0] for number in (query.first, query.second)) > 0  # not at the reset
+    for clip, part in zip(checked_clips(learner, query), query.trajectories, strict=True):
+        assert (clip.width, clip.height, clip.frames) == (96, 64, 7)
+        sheet = np.asarray(Image.open(io.BytesIO(clip.sheet)).convert("L"))
+        for place, state in enumerate(part.states):
+            row, column = divmod(place, clip.columns)
+            shown = sheet[64 * row : 64 * (row + 1), 96 * column : 96 * (column + 1)]
+            env.state = state
+            np.testing.assert_array_equal(shown > 127, env.render()[:, :, 0] > 127)
 
 
 @pytest.mark.parametrize("env", [Camera(jumps=True), Camera(render_mode=None), Slope(), Many()])
@@ -309,6 +451,12 @@ def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options,
     before = (directory / "events.jsonl").read_bytes()
     assert named in refused(monkeypatch, capsys, "ask", directory, *options)
     assert (directory / "events.jsonl").read_bytes() == before
+
+
+def test_a_simulated_expert_takes_no_practice(monkeypatch, capsys, tmp_path):
+    error = refused(monkeypatch, capsys, "run", "gridworld", "--no-practice", "--out", tmp_path / "new")
+    assert "practice: expected --no-practice with the expert page alone" in error
+    assert not (tmp_path / "new").exists()
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys, directory, tmp_path):

@@ -39,6 +39,10 @@ Answerer = Annotated[
     str | None,
     typer.Option(help="Name or pseudonym of the person who answers; it is kept with each answer and its time."),
 ]
+Practice = Annotated[
+    bool,
+    typer.Option(help="Instructions and two practice questions for a person who has not answered in this run yet."),
+]
 ImportPackage = Annotated[
     bool, typer.Option("--import-package", help="Import the package that the run's environment names (it runs code).")
 ]
@@ -105,14 +109,17 @@ def run(
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Run directory; a new one under runs/ if omitted.")] = None,
     answerer: Answerer = None,
+    practice: Practice = True,
     **options: Any,
 ) -> None:
     """Learn a task from preferences; the run is kept in a directory."""
     _check_expert(options.get("expert"), answerer)
+    if not practice and options.get("expert") != "page":
+        raise ValueError("practice: expected --no-practice with the expert page alone")
     directory = out or fresh_directory(env)
     learner = runs.start(env, directory, seed=seed, **options)
     with continuing(directory):
-        run_to_the_end(learner, directory, answerer=answerer)
+        run_to_the_end(learner, directory, answerer=answerer, practice=practice)
 
 
 @app.command()
@@ -140,6 +147,7 @@ def ask(
     *,
     answers: Annotated[int | None, typer.Option(help="Most answers of this sitting.")] = None,
     answerer: Answerer = None,
+    practice: Practice = True,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; a free one if omitted.")] = 0,
     import_package: ImportPackage = False,
@@ -153,7 +161,8 @@ def ask(
             raise ValueError(
                 f"expert: expected a run that a person answers, got {expert}, a simulated one: {directory}"
             )
-        ask_on_page(learner, directory, answers=answers, answerer=answerer, host=host, port=port)
+        options: dict[str, Any] = {"answers": answers, "answerer": answerer, "practice": practice}
+        ask_on_page(learner, directory, **options, host=host, port=port)
 
 
 @app.command()

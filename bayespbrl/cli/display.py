@@ -20,13 +20,13 @@ console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may conta
 PICTURE = "run.png"
 
 
-def run_to_the_end(learner: Learner, directory: Path, *, answerer: str | None = None) -> None:
+def run_to_the_end(learner: Learner, directory: Path, *, answerer: str | None = None, practice: bool = True) -> None:
     """Run a learner that keeps its events in `directory` to its end, with its progress, then `show_run`.
 
-    `answerer` is the name of the person who answers.
+    `answerer` is the name of the person who answers; `practice` as of `ask_on_page`.
     """
     if learner.settings.expert == "page":
-        return ask_on_page(learner, directory, answerer=answerer)
+        return ask_on_page(learner, directory, answerer=answerer, practice=practice)
     console.print(f"Run directory: {directory}")
     try:
         if learner.settings.expert == "terminal":
@@ -46,6 +46,7 @@ def ask_on_page(
     *,
     answers: int | None = None,
     answerer: str | None = None,
+    practice: bool = True,
     host: str = "127.0.0.1",
     port: int = 0,
 ) -> None:
@@ -55,6 +56,7 @@ def ask_on_page(
       learner: keeps its events in `directory`.
       answers: most answers of this sitting.
       answerer: the person's name, kept beside the answers.
+      practice: whether a person who has not answered in this run yet gets instructions and practice first.
       host, port: of the page; port 0 for a free one.
 
     Raises:
@@ -64,7 +66,8 @@ def ask_on_page(
     from bayespbrl.people.page import Page
     from bayespbrl.people.session import Session
 
-    page = Page(Session(learner, most_answers=answers, answerer=answerer), host=host, port=port)
+    session = Session(learner, most_answers=answers, answerer=answerer, practice=practice)
+    page = Page(session, host=host, port=port)
     console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:\n{page.address}")
     try:
         page.serve()

@@ -18,6 +18,7 @@ from PIL import Image
 
 from bayespbrl.envs.functional import picture
 from bayespbrl.envs.opening import environment_attribute
+from bayespbrl.events import LearnerState
 from bayespbrl.learner import Learner
 from bayespbrl.people.drawing import SIDE, draw_grid, draw_scenes, scene_of
 from bayespbrl.people.plots import draw_plots
@@ -65,10 +66,10 @@ class Clips:
         self.learner = learner
         self._known: OrderedDict[tuple[int, int], Clip] = OrderedDict()
 
-    def of(self, query: Query) -> tuple[Clip, Clip]:
-        """Both clips of a question, in the order shown."""
+    def of(self, query: Query, state: LearnerState) -> tuple[Clip, Clip]:
+        """Both clips of a question in a state, in the order shown."""
         first, second = (
-            self._remembered(number, trajectory)
+            self._remembered(number, trajectory, state)
             for number, trajectory in zip((query.first, query.second), query.trajectories, strict=True)
         )
         if first is not None and second is not None:
@@ -86,11 +87,11 @@ class Clips:
         longest = max(clip.steps for clip in clips)
         return longest / float(np.clip(longest / own, SHORTEST, LONGEST))
 
-    def _remembered(self, number: int, trajectory: Trajectory) -> Clip | None:
-        """The clip of one trajectory; None where only plots of both can be drawn."""
+    def _remembered(self, number: int, trajectory: Trajectory, state: LearnerState) -> Clip | None:
+        """The clip of what is shown of trajectory `number`; None where only plots of both can be drawn."""
         key = number, crc32(trajectory.states.tobytes())  # after an undo the number may be another's
         if key not in self._known:
-            pictures = self._pictures(number, trajectory)
+            pictures = self._pictures(number, trajectory, state)
             if pictures is None:
                 return None
             self._known[key] = sheet_of(pictures, trajectory)
@@ -99,7 +100,7 @@ class Clips:
         self._known.move_to_end(key)
         return self._known[key]
 
-    def _pictures(self, number: int, trajectory: Trajectory) -> list[Image.Image] | None:
+    def _pictures(self, number: int, trajectory: Trajectory, state: LearnerState) -> list[Image.Image] | None:
         environment = self.learner.environment
         shown = spread(len(trajectory.states), MOST_FRAMES)
         scene, grid = scene_of(environment), environment_attribute(environment, "grid_shape")
@@ -107,7 +108,8 @@ class Clips:
             return draw_scenes(scene, trajectory.states, shown)
         if grid is not None:
             return draw_grid(grid, trajectory.states, shown)
-        if (pictures := replayed(self.learner, number, trajectory, shown)) is not None:
+        first = state.clips[number][0] if state.clips else 0
+        if (pictures := replayed(self.learner, number, state.trajectories[number], first + shown)) is not None:
             return pictures
         if (draw := environment_attribute(environment, "draw")) is not None:
             some = spread(len(trajectory.states), SLOW_FRAMES)

@@ -25,7 +25,7 @@ class Moment:
       entries: the events since the answer.
       settled: whether a question waits in `state`, or the run is finished.
       shown: what a person is shown of the question; None until it is drawn.
-      likely: the answers to it, the likeliest first; () until it is drawn.
+      likely: the answers to it, the likeliest first and a tie last; () until it is drawn.
       after: what follows an answer.
       failed: whether computing it raised; then it is computed again when the answer is there.
     """
@@ -49,7 +49,7 @@ class Foresight:
 
     Args:
       cycle: of the learner.
-      show: what a person is shown in a state with a question, and the answers to it, the likeliest first.
+      show: what a person is shown in a state with a question, and the answers to it: the likeliest first, a tie last.
       answerer: who is going to answer; None where that is not known.
     """
 
@@ -102,11 +102,16 @@ class Foresight:
         return self.present
 
     def _ahead(self) -> Iterator[Moment]:
-        """The moments after each answer, then those after two likely ones."""
+        """The moments after each answer, and those after two likely ones.
+
+        A tie comes last where the run has none yet: an iteration follows it, which takes seconds.
+        """
         following = list(self._after(self.present, len(Answer)))
-        yield from following
+        soon = len(following) if self.present.state.preferences.ties else LIKELY + 1
+        yield from following[:soon]
         for moment in following[:LIKELY]:
             yield from self._after(moment, LIKELY)
+        yield from following[soon:]
 
     def _after(self, moment: Moment, most: int) -> Iterator[Moment]:
         query = moment.state.query

@@ -1,7 +1,8 @@
 // The front end of the page and of the notebook's widget: two clips in step, a question, keys and buttons.
 //
 // `model` is anywidget's: get(name), send(message), on(event, callback), off(event, callback).
-//   view           what to show: {phase, turn, task, answered, budget, iteration, clips, rate, worth, sure, advice, undo, say}
+//   view           what to show: {phase, turn, task, answered, budget, iteration, clips, rate, worth, sure, advice, undo, say,
+//                  answerer, practice: [number, of], notice}
 //   first, second  the sprite sheets of the two clips, bytes
 //   whole_page     whether keys count wherever the focus is
 // It sends {turn, answer, seconds} and hears, as "msg:custom", {refused: turn, say} and {connection: "lost" | "back"}.
@@ -9,8 +10,11 @@
 
 const KEYS = {
   ArrowLeft: "first", ArrowRight: "second", ArrowDown: "tie", t: "tie", T: "tie", s: "skip", S: "skip", u: "undo", U: "undo",
+  Enter: "begin",
 };
-const SAID = { first: "First is better", second: "Second is better", tie: "No difference", skip: "Skipped", undo: "Taken back" };
+const SAID = {
+  first: "First is better", second: "Second is better", tie: "No difference", skip: "Skipped", undo: "Taken back", begin: "Practice",
+};
 const REST = 0.8; // seconds on the last picture before the clips start again
 
 const HTML = `
@@ -21,6 +25,20 @@ const HTML = `
     <progress class="bp-progress" max="1" value="0" aria-label="Answers given"></progress>
   </header>
   <h2 class="bp-ask">Which one is better?</h2>
+  <div class="bp-intro">
+    <p>Two clips play side by side. Choose the better one. You decide what is better, unless you were given a rule.</p>
+    <ul>
+      <li><b>First is better</b> <kbd>←</kbd> or <b>Second is better</b> <kbd>→</kbd></li>
+      <li><b>No difference</b> <kbd>↓</kbd> if both are equally good</li>
+      <li><b>Cannot tell</b> <kbd>S</kbd> if you are unsure, which is fine</li>
+      <li><b>Undo</b> <kbd>U</kbd> takes your last answer back</li>
+      <li><b>Pause</b> <kbd>Space</kbd> stops both clips, and starts them again</li>
+    </ul>
+    <p>Take your time. Each answer is kept at once, and you can stop and go on later.</p>
+    <p class="bp-who"></p>
+    <p>You practise first. Practice answers are not kept.</p>
+    <button type="button" class="bp-choice" data-answer="begin"><span>Start the practice</span><kbd>Enter</kbd></button>
+  </div>
   <div class="bp-clips">
     <figure>
       <canvas role="img" width="320" height="320"></canvas>
@@ -125,12 +143,12 @@ function caption(clip, name) {
 }
 
 // What the learner says about the question, without a hint at either side.
-function learnerText({ worth, sure, advice }) {
+function learnerText({ worth, sure, advice, notice }) {
   const parts = [];
   if (sure !== null && sure !== undefined) parts.push(`The learner is ${Math.round(100 * sure)} % sure what you will say.`);
   if (worth !== null && worth !== undefined) parts.push(`Your answer is worth about ${worth.toFixed(2)} bit, of 1 at most.`);
   if (advice) parts.push(advice);
-  return parts.join(" ");
+  return [parts.join(" "), notice].filter(Boolean).join("\n");
 }
 
 function render({ model, el }) {
@@ -163,8 +181,8 @@ function render({ model, el }) {
   }
 
   function progress() {
-    const { answered: done = 0, budget, task = "" } = view;
-    find(".bp-task").textContent = task;
+    const { answered: done = 0, budget, task = "", answerer } = view;
+    find(".bp-task").textContent = answerer ? `${task}, answered by ${answerer}` : task;
     find(".bp-count").textContent = budget ? `${done} of at most ${budget} answers` : `${done} answers`;
     const bar = find(".bp-progress");
     bar.hidden = !budget;
@@ -176,6 +194,7 @@ function render({ model, el }) {
     box.dataset.phase = view.phase ?? "thinking";
     progress();
     if (view.turn !== answered) clearTimeout(slow);
+    if (view.phase === "instructions") return instruct();
     if (view.phase !== "question") {
       lock(true);
       const thinking = view.phase === "thinking" || !view.phase;
@@ -200,12 +219,28 @@ function render({ model, el }) {
     if (view.turn === answered) return; // the answer is on its way
     lock(false);
     box.dataset.turn = view.turn;
-    say("Which one is better?", `Question ${view.answered + 1}. Which one is better? Left arrow: first. Right arrow: second.`);
+    const which = view.practice ? `Practice ${view.practice.join(" of ")}: which one is better?` : "Which one is better?";
+    const number = view.practice ? "" : `Question ${view.answered + 1}. `;
+    say(which, `${number}${which} ${view.notice} Left arrow: first. Right arrow: second.`);
+    focus();
+  }
+
+  function instruct() {
+    const kept = view.answerer ? `under the name ${view.answerer}` : "without a name";
+    find(".bp-who").textContent = `Your answers are kept ${kept}. All windows of this page show the same question and count as one person.`;
+    find(".bp-learner").textContent = "";
+    if (view.turn !== answered) lock(false);
+    say("Before you start", "Before you start: read what is asked, then press Enter.");
+    if (box.dataset.turn !== String(view.turn)) focus(); // a view of the same turn leaves it on the button
+    box.dataset.turn = view.turn;
+  }
+
+  function focus() {
     if (root.contains(document.activeElement) || model.get("whole_page")) box.focus({ preventScroll: true });
   }
 
   function answer(which) {
-    if (locked || (which === "undo" && !view.undo)) return;
+    if (locked || (which === "undo" && !view.undo) || (which === "begin") !== (view.phase === "instructions")) return;
     lock(true);
     answered = view.turn;
     warn(null);
@@ -231,6 +266,7 @@ function render({ model, el }) {
     const presses = target.matches?.("button") && [" ", "Enter"].includes(event.key);
     if (moves || presses) return event.stopPropagation();
     if (event.key !== " " && !(event.key in KEYS)) return;
+    if (event.key !== "Enter" && view.phase === "instructions") return; // it scrolls
     event.preventDefault();
     event.stopPropagation();
     if (event.repeat) return;

@@ -6,6 +6,7 @@ const listeners = {};
 const fire = (event, message) => (listeners[event] ?? []).forEach((callback) => callback(message));
 const pause = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 const GONE = "The program behind this page has ended. Start it again and open the address that it prints.";
+const ELSEWHERE = "This question was answered in another window. That answer counts, and yours does not.";
 const PATIENCE = 20; // seconds without a server until the page stops trying
 
 const model = {
@@ -17,14 +18,18 @@ const model = {
 
 // Sent again until the server has heard it; the server takes each turn once.
 async function post(message) {
-  for (;;) {
+  for (let again = false; ; again = true) {
     try {
       const reply = await fetch("answer", {
         method: "POST",
         headers: { "Content-Type": "application/json" },
         body: JSON.stringify(message),
       });
-      if (!reply.ok) fire("msg:custom", { refused: message.turn, say: reply.status === 409 ? null : await reply.text() });
+      if (again) fire("msg:custom", { connection: "back" });
+      if (reply.ok) return;
+      // what is refused when it is sent again was heard the first time
+      const say = reply.status !== 409 ? await reply.text() : again ? null : ELSEWHERE;
+      fire("msg:custom", { refused: message.turn, say });
       return;
     } catch {
       fire("msg:custom", { connection: "lost" });

@@ -17,10 +17,14 @@ from bayespbrl.trajectories import Trajectory
 def replayed(
     learner: Learner, number: int, trajectory: Trajectory, shown: Int[np.ndarray, " f"]
 ) -> list[Image.Image] | None:
-    """Pictures of the states `shown` of trajectory `number`.
+    """Pictures of the states `shown` of trajectory `number`, in increasing order.
 
-    The environment is reset with the trajectory's seed and does its actions again. Returns None where that does not
-    lead to the same observations, bit for bit, or where the environment does not render.
+    The environment is reset with the trajectory's seed and does its actions again, up to the last of these states.
+    Returns None where that does not lead to the same observations, bit for bit, or where the environment does not
+    render.
+
+    Args:
+      trajectory: all of it, also where a question is about a part: an episode begins at its reset.
     """
     if isinstance(learner.environment.unwrapped, FunctionalEnv):
         return None  # it draws by `draw`, which needs no episode
@@ -35,6 +39,8 @@ def replayed(
                 return None
             if step in wanted:
                 pictures.append(Image.fromarray(rendered_frame(env)))
+            if len(pictures) == len(wanted):
+                break
     except Exception:  # as above
         return None
     finally:

@@ -2,7 +2,8 @@
 
 A turn is one state of the run, and each turn takes one answer or one undo: question → answer → thinking → question. The
 answer is in the log, flushed, before `answer` returns. While a person looks, the thread computes what follows
-(`foresight`) and draws it.
+(`foresight`) and draws it. A person who is new to the run may first get instructions and practice (`practice`), whose
+turns record nothing.
 """
 
 import re
@@ -20,12 +21,14 @@ from bayespbrl.learner import Learner
 from bayespbrl.models.likelihoods import prob
 from bayespbrl.people.clips import Clip, Clips
 from bayespbrl.people.foresight import Foresight, Moment
+from bayespbrl.people.practice import Introduction
 from bayespbrl.preferences import Answer, parse_answer
 
 View = Mapping[str, Any]
-THINKING, QUESTION, FINISHED, FAILED = "thinking", "question", "finished", "failed"
+INSTRUCTIONS, THINKING, QUESTION, FINISHED, FAILED = "instructions", "thinking", "question", "finished", "failed"
 # An answer that is expected to tell less changes little: then the page says that a person may stop.
 LITTLE = questions.LEAST_INFORMATION / np.log(2)  # bits
+BREAK = 20  # answers of a sitting between two reminders that a person may pause
 
 
 class Stale(ValueError):
@@ -40,19 +43,30 @@ class Shown:
     said: View
 
 
+NOTHING_SAID: View = {"worth": None, "sure": None, "advice": ""}
+
+
 class Session:
     """A sitting over a learner, safe to call from any thread.
 
     Args:
       learner: it must not be used elsewhere while the session is open.
       most_answers: of this sitting, after which it is finished; None: as many as the run takes.
-      answerer: name of who answers, kept beside the answers.
+      answerer: name of who answers, kept beside the answers. Only their own answers can be taken back.
+      practice: whether instructions and practice come first, unless that person has already answered in this run.
 
     Raises:
       ValueError: a finished run, a bad number or a bad name.
     """
 
-    def __init__(self, learner: Learner, *, most_answers: int | None = None, answerer: str | None = None):
+    def __init__(
+        self,
+        learner: Learner,
+        *,
+        most_answers: int | None = None,
+        answerer: str | None = None,
+        practice: bool = False,
+    ):
         if learner.finished:
             raise ValueError("learner: expected one with questions left, got a finished run")
         if most_answers is not None:
@@ -60,6 +74,8 @@ class Session:
         if answerer is not None:
             checks.short_name("answerer", answerer)
         self.learner, self.most_answers, self.answerer = learner, most_answers, answerer
+        new = all(past.answerer != answerer for past in learner.state.past)
+        self._introduction = Introduction() if practice and new else None
         self._clips = Clips(learner)
         self._foresight = Foresight(learner.cycle, learner.state, self._show, answerer)
         self._changed = threading.Condition(threading.RLock())
@@ -72,6 +88,8 @@ class Session:
 
     def open(self) -> "Session":
         """Start to think; returns the session."""
+        with self._changed:
+            self._settle()
         self._thread.start()
         return self
 
@@ -92,6 +110,12 @@ class Session:
     def over(self) -> bool:
         """Whether the sitting is finished, or has failed."""
         return self._view["phase"] in (FINISHED, FAILED)
+
+    @property
+    def idle(self) -> bool:
+        """Whether a person is shown something and all that may follow is computed."""
+        with self._changed:
+            return self._view["phase"] != THINKING and self._pending() is None
 
     def sheet(self, turn: int, side: int) -> bytes:
         """The sprite sheet of a clip of the question of a turn, side 0 or 1; `Stale` where the turn is over."""
@@ -115,20 +139,27 @@ class Session:
     def answer(self, turn: int, answer: str, seconds: float | None = None) -> None:
         """Take the answer to the question of `turn`, or an undo there; it is on the disk when this returns.
 
+        The instructions are answered with "begin". What is answered to them and in practice is not kept.
+
         Raises:
           Stale: the turn is over, or its question is not there yet; nothing has happened.
           ValueError: no answer, a bad time, or nothing to take back; nothing has happened.
         """
         with self._changed:
-            if turn != self._turn or self._view["phase"] != QUESTION:
+            if turn != self._turn or self._view["phase"] not in (INSTRUCTIONS, QUESTION):
                 raise Stale(f"turn: expected {self._turn}, got {turn}")
-            if answer == Answer.UNDO:
+            if self._introducing is not None:
+                self._introducing.answer(answer)
+                self._turn += 1
+            elif answer == Answer.UNDO:
                 self._undo()
             else:
                 self._take(answer, seconds)
             self._settle()
 
     def _undo(self) -> None:
+        if not self._view["undo"]:
+            raise ValueError("undo: expected an answer of the same person's to take back, got none")
         self.learner.undo()
         self._turn += 1
         self._foresight.back(self.learner.state)
@@ -188,7 +219,9 @@ class Session:
         present = self._foresight.present
         if present.failed:
             return
-        if present.complete:
+        if (introduction := self._introducing) is not None:
+            self._introduce(introduction)
+        elif present.complete:
             self._publish(present)
         else:
             self._set(self._described(THINKING))
@@ -197,11 +230,13 @@ class Session:
     # What is shown.
 
     def _show(self, state: LearnerState) -> tuple[Shown, tuple[Answer, ...]]:
-        """The clips of the question that waits, and the answers to it, the likeliest first."""
+        """The clips of the question that waits, and the answers to it, the likeliest first and a tie last."""
         query = state.query
         assert query is not None
-        clips = self._clips.of(query)
-        said: dict[str, Any] = {"worth": None, "sure": None, "advice": ""}
+        if self._introduction is not None and self._introduction.clips is None:
+            self._introduction.draw(self._clips, state)
+        clips = self._clips.of(query, state)
+        said = dict(NOTHING_SAID)
         first = 0.5
         if state.estimate is not None and state.estimate.posterior is not None:
             draws = state.estimate.trajectory_draws(query.trajectories, number=queries.QUERY_DRAWS)
@@ -214,7 +249,7 @@ class Session:
                     f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
                 )
         likely = (Answer.FIRST, Answer.SECOND) if first >= 0.5 else (Answer.SECOND, Answer.FIRST)
-        return Shown(clips, said), (*likely, Answer.TIE, Answer.SKIP)
+        return Shown(clips, said), (*likely, Answer.SKIP, Answer.TIE)  # after a skip there is little to compute
 
     def _described(self, phase: str, state: LearnerState | None = None) -> dict[str, Any]:
         state, settings = state or self.learner.state, self.learner.settings
@@ -225,21 +260,50 @@ class Session:
             "answered": state.preferences.answers,
             "budget": settings.questions.answers,
             "iteration": state.iteration,
-            "undo": state.previous is not None,
+            "undo": state.previous is not None and state.past[-1].answerer == self.answerer,
+            "answerer": self.answerer,
+            "practice": None,
+            "notice": "",
             "say": "",
         }
 
+    @property
+    def _introducing(self) -> Introduction | None:
+        """What comes before the first question, while it lasts; None where there is none, or no question to come."""
+        introduction, present = self._introduction, self._foresight.present
+        if introduction is None or introduction.over or (present.complete and present.state.query is None):
+            return None
+        return introduction
+
+    def _introduce(self, introduction: Introduction) -> None:
+        if introduction.place == 0:
+            self._set(self._described(INSTRUCTIONS))
+        elif introduction.clips is None:
+            self._set(self._described(THINKING))
+        else:
+            place, number = introduction.place, len(introduction.clips)
+            notice = "This is practice: your answer is not kept."
+            view = self._described(QUESTION) | {"practice": (place, number), "notice": notice, "undo": True}
+            self._ask(view, Shown(introduction.clips[place - 1], NOTHING_SAID))
+
     def _publish(self, moment: Moment) -> None:
         state = moment.state
-        done = self.most_answers is not None and state.preferences.answers - self._before >= self.most_answers
+        given = state.preferences.answers - self._before
+        done = self.most_answers is not None and given >= self.most_answers
         if state.query is None or done:
             self._set(self._described(FINISHED, state) | {"say": self._ending(state)})
             return
-        shown: Shown = moment.shown
+        notice = ""
+        if given > 0 and given % BREAK == 0:
+            notice = f"You have given {given} answers. Pause when you like; nothing is lost."
+        elif not given and self._introduction is not None:
+            notice = "The practice is over. From now on your answers are kept."
+        self._ask(self._described(QUESTION, state) | {"notice": notice}, moment.shown)
+
+    def _ask(self, view: View, shown: Shown) -> None:
         self._sheets = self._turn, shown.clips
         clips = [clip.described() for clip in shown.clips]
-        view = self._described(QUESTION, state) | {"clips": clips, "rate": self._clips.rate(shown.clips)}
-        self._set(view | dict(shown.said))
+        self._set({**view, "clips": clips, "rate": self._clips.rate(shown.clips), **shown.said})
 
     def _ending(self, state: LearnerState) -> str:
         """Why there is no further question."""
