@@ -36,8 +36,8 @@ def written_aside(file: Path) -> Iterator[Path]:
 def write_netcdf(file: Path, data: xr.Dataset | xr.DataTree) -> None:
     """Write a netCDF file, whole or not at all.
 
-    HDF5 ends the process where the disk is full while it writes to it; the bytes are therefore made in memory. In a Dask
-    worker xarray would lock them by a lock of the cluster, which needs a file name and fails without one.
+    HDF5 ends the process where the disk is full while it writes to it; the bytes are therefore made in memory. In a
+    Dask worker xarray would lock them by a lock of the cluster, which needs a file name and fails without one.
     """
     content = io.BytesIO()
     dask = sys.modules.get("dask")  # imported wherever this may be a Dask worker

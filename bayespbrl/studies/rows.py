@@ -12,9 +12,10 @@ from bayespbrl import checks, runs
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.learner import Learner, task_of
 from bayespbrl.rollouts import open_environment
-from bayespbrl.runs.directory import RunDirectory, read_summary
+from bayespbrl.runs.directory import RunDirectory, read_complete_summary, read_summary
 from bayespbrl.runs.simulated import SIMULATED, expert_of
 from bayespbrl.settings import Settings, settings_for
+from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
     collect,
     collect_first_policies,
@@ -44,6 +45,7 @@ class Row:
       preference_within: the number of iterations within which a trial has to meet a preference; None: no need.
       balancing_steps: None where no balancing time is measured.
       untrained: whether only the value of the first policy is measured, which is the random policy.
+      baseline: the algorithm of `bayespbrl.baselines` that runs instead of the learner; None: the learner.
       name: in messages, before the seed; empty for a study of one row.
     """
 
@@ -55,6 +57,7 @@ class Row:
     balancing_steps: int | None
     untrained: bool = False
     name: str = ""
+    baseline: str | None = None
 
     def path(self, seed: int) -> Path:
         return self.directory / f"seed-{seed}"
@@ -73,6 +76,8 @@ class Row:
             raise ValueError(f"{path}: expected a trial with these settings, got others: {kept.settings}")
         if self.untrained:
             return True if has_first_policy(path) else None
+        if self.baseline is not None:
+            return True if (path / BASELINE_FILE).exists() else None
         if (path / "summary.json").exists() and self.redraws(read_summary(path)["iterations"]):
             return False
         measured = self.balancing_steps is None or has_balancing(path)
@@ -92,6 +97,7 @@ def row_of(
     seed: int,
     preference_within: int | None = None,
     untrained: bool = False,
+    baseline: str | None = None,
     name: str = "",
 ) -> Row:
     """A row, its settings completed and checked; its first trial has `seed`.
@@ -111,7 +117,7 @@ def row_of(
         raise ValueError(f"expert: expected one of {', '.join(SIMULATED)}, which are simulated, got {first.expert!r}")
     within = PREFERENCE_WITHIN.get(identity) if preference_within is None else preference_within
     balancing = BALANCING_STEPS.get(identity)
-    return Row(env, directory, first, dict(options), within, balancing, untrained, name)
+    return Row(env, directory, first, dict(options), within, balancing, untrained, name, baseline)
 
 
 @dataclass
@@ -157,6 +163,9 @@ def run_trial(row: Row, seed: int) -> bool:
     if row.untrained:
         measure_first_policy(learner, path)
         return True
+    if row.baseline is not None:
+        measure_baseline(learner, row.baseline, path)
+        return True
     return _trained(row, learner, path)
 
 
@@ -184,6 +193,9 @@ def collected(seeds: Seeds) -> xr.Dataset:
     """The finished trials of a row as one data set (`tables.collect`), with the redrawn ones as attributes."""
     paths = [seeds.row.path(seed) for seed in seeds.with_outcome(True)]
     redrawn = seeds.with_outcome(False)
-    table = collect_first_policies(paths, seeds.row.settings.env) if seeds.row.untrained else collect(paths)
+    if seeds.row.untrained:
+        table = collect_first_policies(paths, seeds.row.settings.env)
+    else:
+        table = collect(paths, read_complete_summary if seeds.row.baseline is None else read_baseline)
     table.attrs |= {"redraws": len(redrawn), "redrawn_seeds": " ".join(map(str, redrawn))}
     return table

@@ -86,6 +86,7 @@ class Study:
                     declared.options,
                     seed=declaration.seed,
                     untrained=declared.untrained,
+                    baseline=declared.baseline,
                     name=declared.name,
                 )
             except ValueError as error:
@@ -212,7 +213,7 @@ def _check_same(declaration: Declaration, directory: Path) -> None:
 
 def _settled(declaration: Declaration) -> tuple[Any, ...]:
     """What may not change between two calls of a study."""
-    rows = [(row.levels, row.env, dict(row.options), row.untrained) for row in declaration.rows]
+    rows = [(row.levels, row.env, dict(row.options), row.untrained, row.baseline) for row in declaration.rows]
     return declaration.seed, rows
 
 
