@@ -13,7 +13,7 @@ Decisions, where the sources are silent or differ:
 * The mean over all pairs of visits of a cell is one sample for it.
 * A tie changes nothing.
 * After an answer the learner would act by the greedy policy, any of the best actions with equal probability.
-* Learning rate, exploration and the number of cells were chosen on seeds that are used for nothing else.
+* Learning rate, exploration and the number of cells were chosen among five on seeds 0 to 7, after 75 answers.
 """
 
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ from bayespbrl.preferences import Answer, parse_answer
 
 CELLS = 6  # per dimension of the observation
 LEARNING_RATE = 0.2  # α
-EXPLORATION = 0.3  # η of EXP3
+EXPLORATION = 0.1  # η of EXP3
 
 
 def every_visit_preferences(

@@ -97,7 +97,6 @@ def row_of(
     seed: int,
     preference_within: int | None = None,
     untrained: bool = False,
-    baseline: str | None = None,
     name: str = "",
 ) -> Row:
     """A row, its settings completed and checked; its first trial has `seed`.
@@ -117,7 +116,7 @@ def row_of(
         raise ValueError(f"expert: expected one of {', '.join(SIMULATED)}, which are simulated, got {first.expert!r}")
     within = PREFERENCE_WITHIN.get(identity) if preference_within is None else preference_within
     balancing = BALANCING_STEPS.get(identity)
-    return Row(env, directory, first, dict(options), within, balancing, untrained, name, baseline)
+    return Row(env, directory, first, dict(options), within, balancing, untrained, name)
 
 
 @dataclass

@@ -12,7 +12,7 @@ import platform
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.metadata import version
@@ -86,12 +86,11 @@ class Study:
                     declared.options,
                     seed=declaration.seed,
                     untrained=declared.untrained,
-                    baseline=declared.baseline,
                     name=declared.name,
                 )
             except ValueError as error:
                 raise ValueError(f"study {declaration.name}, {declared.name}: {error}") from error
-            seeds = Seeds(row, number)
+            seeds = Seeds(replace(row, baseline=declared.baseline), number)
             seeds.to_do()
             rows.append(seeds)
         return cls(declaration, directory, number, rows)
