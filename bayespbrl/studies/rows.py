@@ -12,7 +12,7 @@ from bayespbrl import checks, runs
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.learner import Learner, task_of
 from bayespbrl.rollouts import open_environment
-from bayespbrl.runs.directory import RunDirectory, read_complete_summary, read_summary
+from bayespbrl.runs.directory import RunDirectory, read_summary
 from bayespbrl.runs.simulated import SIMULATED, expert_of
 from bayespbrl.settings import Settings, settings_for
 from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
@@ -195,6 +195,6 @@ def collected(seeds: Seeds) -> xr.Dataset:
     if seeds.row.untrained:
         table = collect_first_policies(paths, seeds.row.settings.env)
     else:
-        table = collect(paths, read_complete_summary if seeds.row.baseline is None else read_baseline)
+        table = collect(paths, None if seeds.row.baseline is None else read_baseline)
     table.attrs |= {"redraws": len(redrawn), "redrawn_seeds": " ".join(map(str, redrawn))}
     return table
