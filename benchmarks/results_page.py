@@ -13,6 +13,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,15 +24,16 @@ import pandas as pd
 from bayespbrl.results.figures import curves_figure, profiles_figure
 from bayespbrl.results.intervals import failed_trials, median_interval
 from bayespbrl.results.study_data import RowData, StudyData, read_study
-from bayespbrl.results.tables import markdown
+from bayespbrl.results.tables import MISSING, markdown
 from bayespbrl.results.write import section, tables_of
 from bayespbrl.runs.directory import read_summary
+from bayespbrl.studies.baseline_trials import read_baseline
 from bayespbrl.studies.declaration import declared
 from bayespbrl.studies.rows import row_of, run_trial
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "RESULTS.md"
-STUDIES, EARLIER = HERE / "studies", HERE / "results"
+STUDIES, EARLIER, PUBLISHED = HERE / "studies", HERE / "results", HERE / "published"
 # A trial that ends below has failed, in the earlier studies.
 EARLIER_FAILED = {"swing-up": -1300.0, "gridworld": 0.99 * 294.8125}
 TOLERANCE = 1e-5  # relative: the data have six digits
@@ -56,12 +58,34 @@ def page(studies: dict[str, StudyData]) -> str:
         made = [kind for kind, make in FIGURES.items() if name in studies and make(studies[name]) is not None]
         return "\n".join(f"![{kind} of the study {name}](benchmarks/studies/{name}/{kind}.png)" for kind in made)
 
+    def beside(name: str, task: str, file: str, unit: float) -> str:
+        return published(studies[name], task, file, unit) if name in studies else ""
+
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     template = environment.from_string((HERE / "RESULTS.md.jinja").read_text())
-    return template.render(tables=tables, figures=figures, earlier=earlier)
+    return template.render(tables=tables, figures=figures, beside=beside, earlier=earlier)
 
 
 FIGURES = {"curves": curves_figure, "profiles": profiles_figure}
+
+
+def published(data: StudyData, task: str, file: str, unit: float) -> str:
+    """Medians and quartiles of a published curve and, after as many answers, of the rows of a task, over `unit`."""
+    lines = []
+    for _, known in pd.read_csv(PUBLISHED / file).iterrows():
+        line = {"answers": f"{known['answers']:g}"}
+        line["published"] = _quartiles(known["lower"], known["median"], known["upper"])
+        for row in data.of_task(task):
+            if not row.declared.untrained:
+                values = row.at(known["answers"])
+                shown = MISSING if values is None else _quartiles(*np.quantile(values / unit, [0.25, 0.5, 0.75]))
+                line[f"{row.declared.name.partition('/')[2]}, here"] = shown
+        lines.append(line)
+    return markdown(pd.DataFrame(lines))
+
+
+def _quartiles(low: float, middle: float, high: float) -> str:
+    return f"{middle:.3f} [{low:.3f} … {high:.3f}]"
 
 
 def earlier(task: str) -> str:
@@ -115,9 +139,10 @@ def differences_of_a_cell(data: StudyData) -> list[str]:
     seed = row.seeds[0]
     kept = row.lines[row.lines["seed"] == seed]
     with tempfile.TemporaryDirectory() as folder:
-        cell = row_of(row.declared.env, Path(folder) / "row", row.declared.options, seed=seed)
+        learner = row_of(row.declared.env, Path(folder) / "row", row.declared.options, seed=seed)
+        cell = replace(learner, baseline=row.declared.baseline)
         run_trial(cell, seed)
-        again = read_summary(cell.path(seed))["iterations"]
+        again = (read_summary if cell.baseline is None else read_baseline)(cell.path(seed))["iterations"]
     where = f"study {data.name}, {row.declared.name}, seed {seed}"
     if len(again) != len(kept):
         return [f"{where}: expected {len(kept)} iterations, got {len(again)}"]
@@ -126,7 +151,8 @@ def differences_of_a_cell(data: StudyData) -> list[str]:
         f"{where}, iteration {entry['iteration']}: expected {name} {expected}, got {entry[name]}"
         for entry, (_, line) in zip(again, kept.iterrows(), strict=True)
         for name in names
-        if not np.isclose(expected := float(line[name]), float(entry[name]), rtol=TOLERANCE, atol=1e-9)
+        if name in entry
+        and not np.isclose(expected := float(line[name]), float(entry[name]), rtol=TOLERANCE, atol=1e-9)
     ]
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from bayespbrl.models import PreferenceModel, fit_gaussian, sample_posterior
@@ -162,6 +163,22 @@ def test_results_follow_from_the_committed_data_and_a_changed_figure_is_found(tm
     assert any("-9555" in line for line in page.check(studies, changed))
     for folder in (BENCHMARKS / "studies").iterdir():
         assert f"](benchmarks/studies/{folder.name}/" in text
+
+
+def test_a_published_curve_stands_beside_the_values_after_as_many_answers():
+    page = benchmark("results_page")
+    table = page.published(page.committed()["pf"], "gridworld", "pf-gridworld.csv", 294.8125).splitlines()
+    lines = pd.read_csv(BENCHMARKS / "studies" / "pf" / "iterations.csv")
+    after = lines[(lines["methods"] == "pf") & (lines["answers"] == 13)]["value"] / 294.8125
+    low, middle, high = np.quantile(after, [0.25, 0.5, 0.75])
+    assert len(after) == 20
+    assert f"| 13 | 0.503 [0.503 … 0.503] | {middle:.3f} [{low:.3f} … {high:.3f}] |" in table
+
+
+@pytest.mark.slow
+def test_a_baseline_is_reproduced():
+    page = benchmark("results_page")
+    assert page.differences_of_a_cell(page.committed()["pf"]) == []
 
 
 @pytest.mark.slow

@@ -52,6 +52,7 @@ BAD = {
     "same_start": [None, 1, "yes"],
     "clip_steps": [0, 1.5, "all"],
     "worthwhile": [None, 1, "yes"],
+    "plain_draws": [0, 15, 200.0, True],
     "repeats": [None, 1, -0.1, "all"],
     "checked": [None, 1, "yes"],
     "critic_iterations": [0, -4, True, 2.0],

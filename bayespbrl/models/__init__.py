@@ -10,6 +10,7 @@ gaussian_fit             both of these for given answers
 preference_problem       the model in low rank given all else, and the ellipses that sample it fast
 gibbs                    moves over all else: length scales, steepness, lapse rates, tie threshold; chains runs both
 evidence                 the marginal likelihood, by bridge sampling
+plain_chain              the paper's sampler: a chain of fixed length
 posterior                draws until the chains have converged; posterior_tree has them in ArviZ's schema
 convergence              R̂, effective sample size and Monte Carlo error
 linear_program           eq. 10, the alternative to the posterior
@@ -18,6 +19,7 @@ linear_program           eq. 10, the alternative to the posterior
 from bayespbrl.models.elliptical_slice_kernel import EllipticalSlice
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian
 from bayespbrl.models.linear_program import LinearProgramResult, linear_program
+from bayespbrl.models.plain_chain import plain_draws
 from bayespbrl.models.posterior import posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import restored, stored
 from bayespbrl.models.preference_model import (
@@ -38,6 +40,7 @@ __all__ = [
     "fit_gaussian",
     "joint_preference_model",
     "linear_program",
+    "plain_draws",
     "posterior_draws",
     "preference_model",
     "restored",

@@ -20,7 +20,7 @@ def write_predictions(study: Study) -> Path:
     lines = [
         [*declared.levels, seed, *answer]
         for declared, seeds in zip(study.declaration.rows, study.rows, strict=True)
-        if not declared.untrained
+        if not declared.untrained and declared.baseline is None
         for seed in seeds.with_outcome(True)
         for answer in _predicted(seeds.row.path(seed))
     ]

@@ -123,7 +123,7 @@ def runs_table(data: StudyData) -> pd.DataFrame:
     """A line for each row: the settings, and whether its fits and updates can be believed."""
     lines = []
     for row in data.rows:
-        if row.declared.untrained:
+        if row.declared.untrained or row.declared.baseline is not None:
             continue
         seen = row.lines
         options = " ".join(f"{name}={value}" for name, value in sorted(row.declared.options.items()))

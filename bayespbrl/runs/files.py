@@ -2,11 +2,15 @@
 
 import io
 import os
+import sys
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import xarray as xr
+
+_ONE_AT_A_TIME = threading.Lock()  # the setting of Dask below is the whole process's
 
 
 @contextmanager
@@ -32,10 +36,13 @@ def written_aside(file: Path) -> Iterator[Path]:
 def write_netcdf(file: Path, data: xr.Dataset | xr.DataTree) -> None:
     """Write a netCDF file, whole or not at all.
 
-    HDF5 ends the process where the disk is full while it writes to it; the bytes are therefore made in memory.
+    HDF5 ends the process where the disk is full while it writes to it; the bytes are therefore made in memory. In a
+    Dask worker xarray would lock them by a lock of the cluster, which needs a file name and fails without one.
     """
     content = io.BytesIO()
-    data.to_netcdf(content, engine="h5netcdf")
+    dask = sys.modules.get("dask")  # imported wherever this may be a Dask worker
+    with _ONE_AT_A_TIME, nullcontext() if dask is None else dask.config.set(scheduler="threads"):
+        data.to_netcdf(content, engine="h5netcdf")
     write_file(file, content.getvalue())
 
 

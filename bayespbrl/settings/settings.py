@@ -144,6 +144,8 @@ class Settings:
         utility, query, schedule = self.estimation.utility, self.questions.query, self.update.schedule
         if utility in WITHOUT_POSTERIOR and query not in ("highest-utility", "other"):
             raise ValueError(f"query: expected highest-utility with {utility}, no posterior, got {query!r}")
+        if self.estimation.plain_draws is not None and None in (self.model.steepness, self.model.lapse_rate):
+            raise ValueError("plain_draws: expected a given steepness and lapse_rate, got one that is inferred")
         if query == "information-when-unsure" and schedule != "confidence":
             raise ValueError(f"schedule: expected confidence with the query {query}, got {schedule!r}")
         number = self.rollouts.trajectories_per_iteration

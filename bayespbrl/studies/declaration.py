@@ -15,6 +15,9 @@ failed_below = 150               # a trial that ends below this value has failed
 [methods.random-policy]
 untrained = true                 # only the value of the first policy is measured
 
+[methods.pf]
+baseline = "pf"                  # another algorithm, of bayespbrl.baselines, as many answers as the options come to
+
 [noise.mistaken]
 expert = "mistaken"
 
@@ -33,11 +36,16 @@ from pathlib import Path
 from typing import Any
 
 from bayespbrl import checks
+from bayespbrl.baselines import BASELINES
 from bayespbrl.settings import OPTIONS
 
 AXES = ("tasks", "methods", "noise", "variants")
 OWN = ("title", "trials", "seed", "report_at", "options", "leave_out", *AXES)
-OF_A_LEVEL = {"tasks": ("env", "minutes", "failed_below"), "methods": ("untrained",), "variants": ("minutes",)}
+OF_A_LEVEL = {
+    "tasks": ("env", "minutes", "failed_below"),
+    "methods": ("untrained", "baseline", "minutes"),
+    "variants": ("minutes",),
+}
 LEVEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 Options = Mapping[str, Any]
 
@@ -51,6 +59,7 @@ class DeclaredRow:
       env: a short name or a gymnasium id.
       options: of each trial, but for its seed.
       untrained: whether only the first policy's value is measured.
+      baseline: the algorithm of `bayespbrl.baselines` that runs instead of the learner; None: the learner.
       minutes: of a trial on one core, as declared; None: not known.
       failed_below: a trial that ends below this value has failed; None: not declared.
     """
@@ -61,6 +70,7 @@ class DeclaredRow:
     untrained: bool = False
     minutes: float | None = None
     failed_below: float | None = None
+    baseline: str | None = None
 
     @property
     def name(self) -> str:
@@ -162,6 +172,8 @@ def _axis(where: str, axis: str, content: Mapping[str, Any]) -> dict[str, Option
             checks.finite(f"{place}, {name}", _number(f"{place}, {name}", options[name]))
         if not isinstance(options.get("env", ""), str) or not isinstance(options.get("untrained", False), bool):
             raise ValueError(f"{place}: expected env as text and untrained as true or false, got {dict(options)}")
+        if "baseline" in options:
+            checks.one_of(f"{place}, baseline", options["baseline"], tuple(BASELINES))
     return dict(levels) or {"": {}}
 
 
@@ -218,4 +230,5 @@ def _row(common: Options, chosen: tuple[tuple[str, Options], ...]) -> DeclaredRo
         bool(own["untrained"]),
         own["minutes"],
         own["failed_below"],
+        own["baseline"],
     )

@@ -15,6 +15,7 @@ from bayespbrl.rollouts import open_environment
 from bayespbrl.runs.directory import RunDirectory, read_summary
 from bayespbrl.runs.simulated import SIMULATED, expert_of
 from bayespbrl.settings import Settings, settings_for
+from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
     collect,
     collect_first_policies,
@@ -44,6 +45,7 @@ class Row:
       preference_within: the number of iterations within which a trial has to meet a preference; None: no need.
       balancing_steps: None where no balancing time is measured.
       untrained: whether only the value of the first policy is measured, which is the random policy.
+      baseline: the algorithm of `bayespbrl.baselines` that runs instead of the learner; None: the learner.
       name: in messages, before the seed; empty for a study of one row.
     """
 
@@ -55,6 +57,7 @@ class Row:
     balancing_steps: int | None
     untrained: bool = False
     name: str = ""
+    baseline: str | None = None
 
     def path(self, seed: int) -> Path:
         return self.directory / f"seed-{seed}"
@@ -73,6 +76,8 @@ class Row:
             raise ValueError(f"{path}: expected a trial with these settings, got others: {kept.settings}")
         if self.untrained:
             return True if has_first_policy(path) else None
+        if self.baseline is not None:
+            return True if (path / BASELINE_FILE).exists() else None
         if (path / "summary.json").exists() and self.redraws(read_summary(path)["iterations"]):
             return False
         measured = self.balancing_steps is None or has_balancing(path)
@@ -157,6 +162,9 @@ def run_trial(row: Row, seed: int) -> bool:
     if row.untrained:
         measure_first_policy(learner, path)
         return True
+    if row.baseline is not None:
+        measure_baseline(learner, row.baseline, path)
+        return True
     return _trained(row, learner, path)
 
 
@@ -184,6 +192,9 @@ def collected(seeds: Seeds) -> xr.Dataset:
     """The finished trials of a row as one data set (`tables.collect`), with the redrawn ones as attributes."""
     paths = [seeds.row.path(seed) for seed in seeds.with_outcome(True)]
     redrawn = seeds.with_outcome(False)
-    table = collect_first_policies(paths, seeds.row.settings.env) if seeds.row.untrained else collect(paths)
+    if seeds.row.untrained:
+        table = collect_first_policies(paths, seeds.row.settings.env)
+    else:
+        table = collect(paths, None if seeds.row.baseline is None else read_baseline)
     table.attrs |= {"redraws": len(redrawn), "redrawn_seeds": " ".join(map(str, redrawn))}
     return table

@@ -12,7 +12,7 @@ import platform
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.metadata import version
@@ -90,7 +90,7 @@ class Study:
                 )
             except ValueError as error:
                 raise ValueError(f"study {declaration.name}, {declared.name}: {error}") from error
-            seeds = Seeds(row, number)
+            seeds = Seeds(replace(row, baseline=declared.baseline), number)
             seeds.to_do()
             rows.append(seeds)
         return cls(declaration, directory, number, rows)
@@ -212,7 +212,7 @@ def _check_same(declaration: Declaration, directory: Path) -> None:
 
 def _settled(declaration: Declaration) -> tuple[Any, ...]:
     """What may not change between two calls of a study."""
-    rows = [(row.levels, row.env, dict(row.options), row.untrained) for row in declaration.rows]
+    rows = [(row.levels, row.env, dict(row.options), row.untrained, row.baseline) for row in declaration.rows]
     return declaration.seed, rows
 
 

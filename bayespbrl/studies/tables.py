@@ -1,7 +1,7 @@
 """The results of many trials as tables: the figures of each iteration, and the balancing time of the final policies."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,16 @@ BALANCING_FILE = "balancing.json"
 FIRST_POLICY_FILE = "first-policy.json"  # of a trial that does not learn: the random policy
 
 
-def collect(directories: Sequence[Path | str]) -> xr.Dataset:
-    """The summaries of finished runs as one data set over (seed, iteration).
+def collect(
+    directories: Sequence[Path | str], read: Callable[[Path | str], dict[str, Any]] | None = None
+) -> xr.Dataset:
+    """The summaries of finished runs as one data set over (seed, iteration); `read` reads one, None for a run's.
 
     A run that ended earlier than others keeps its last figures, but for the seconds, until the last of them ends.
     Numbers are kept, and lists of numbers with a dimension of their own. Those of a nested entry have both names, as
     `seconds_utility`. Missing numbers are NaN.
     """
-    summaries = [read_complete_summary(path) for path in directories]
+    summaries = [(read or read_complete_summary)(path) for path in directories]
     seeds = [summary["seed"] for summary in summaries]
     length = max(len(summary["iterations"]) for summary in summaries)
     iterations = list(range(1, length + 1))

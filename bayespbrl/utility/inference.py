@@ -9,7 +9,7 @@ from xarray import DataTree
 
 from bayespbrl import checks
 from bayespbrl.features import StateFeatures
-from bayespbrl.models import Answers, PreferenceModel, linear_program, posterior_draws
+from bayespbrl.models import Answers, PreferenceModel, linear_program, plain_chain, plain_draws, posterior_draws
 from bayespbrl.models.posterior_tree import bases_of
 from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
@@ -33,17 +33,24 @@ class Estimation:
         lapse rate unless they are set; `given` keeps all.
       trajectory_discount: γ of ψ(τ) in the answers; 1 for an expert who judges whole trajectories; None for the
         critic's, as in the paper.
+      plain_draws: moves of the paper's sampler, one chain without a check of convergence (`models.plain_chain`), which
+        leaves ties out; None: chains until they converge.
     """
 
     utility: str = "posterior-mean"
     hyperparameters: str = "inferred"
     trajectory_discount: float | None = 1.0
+    plain_draws: int | None = None
 
     def __post_init__(self) -> None:
         checks.one_of("utility", self.utility, METHODS)
         checks.one_of("hyperparameters", self.hyperparameters, ("inferred", "given"))
         if self.trajectory_discount is not None:
             checks.share("trajectory_discount", self.trajectory_discount)
+        if self.plain_draws is not None:
+            checks.whole("plain_draws", self.plain_draws, plain_chain.LEAST)
+            if self.hyperparameters != "given":
+                raise ValueError(f"hyperparameters: expected given with plain_draws, got {self.hyperparameters!r}")
 
 
 def estimate(
@@ -70,7 +77,8 @@ def estimate(
     rng = np.random.default_rng([seed, 2])
     multiples = settings(features, inferred=options.hyperparameters == "inferred", rng=rng)
     sums = sums_under(features, multiples, comparisons.trajectories, discount=comparisons.discount)
-    return _by_posterior(sums, multiples, comparisons, features, options.utility, model, seed)
+    method, plain = options.utility, options.plain_draws
+    return _by_posterior(sums, multiples, comparisons, features, method, model, seed, plain)
 
 
 def infer_utility(
@@ -142,13 +150,19 @@ def _by_posterior(
     method: str,
     model: PreferenceModel,
     seed: int,
+    plain: int | None = None,
 ) -> PosteriorUtility:
     """Eqs. 7-8, from ψ of the trajectories under each setting, (n, D)."""
     for each in feature_sums:
         checks.finite("feature_sums", each)
     scaled = [normalised(comparisons.differences(each)) for each in feature_sums]
     differences, scales = np.array([each for each, _ in scaled]), np.array([scale for _, scale in scaled])
-    tree = posterior_draws(differences, model, seed=seed, answers=comparisons.answers)
+    if plain is None:
+        tree = posterior_draws(differences, model, seed=seed, answers=comparisons.answers)
+    else:
+        ordered = comparisons.ordered  # a row of zeros has no say
+        known = np.where(ordered[:, None], differences, 0.0)
+        tree = plain_draws(known, model, draws=plain, seed=seed, number_of_preferences=int(ordered.sum()))
     parts = _parts(tree, method, seed)
     margins = np.einsum("ckd,cd->k", differences, parts)
     quality = FitQuality(

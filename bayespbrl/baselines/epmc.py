@@ -1,0 +1,175 @@
+"""EPMC: every-visit preference Monte Carlo, which estimates for each state which of two actions is the better one.
+
+Source: Wirth & Fürnkranz (2013), "EPMC: Every visit preference Monte Carlo for reinforcement learning", ACML. Two
+trajectories are compared. Of the n states that both visited one may have decided, so that an action of the preferred
+trajectory is better than another one of the other with probability (n+1)/2n in each (`sampled`). The estimates move
+towards these with a learning rate; pairwise coupling turns them into a value of each action (`action_values`); EXP3
+(Auer et al. 1995) explores by it. The first trajectory explores. The second explores in the states of the first and is
+greedy in all others, so that decisions in shared states differ and the rest is as good as can be.
+
+Decisions, where the sources are silent or differ:
+* Observations are numbered by a grid of equal cells, actions are the least, the middle and the greatest.
+* n counts the cells that both trajectories visited, whichever actions they took there.
+* The mean over all pairs of visits of a cell is one sample for it.
+* A tie changes nothing.
+* After an answer the learner would act by the greedy policy, any of the best actions with equal probability.
+* Learning rate, exploration and the number of cells were chosen among five on seeds 0 to 7, after 75 answers.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.spaces import Box
+from jax import Array
+from jaxtyping import Float, Int, Key
+
+from bayespbrl import rollouts
+from bayespbrl.baselines.steps import Step
+from bayespbrl.experts import Expert
+from bayespbrl.policies.policy import AnyArray
+from bayespbrl.preferences import Answer, parse_answer
+
+CELLS = 6  # per dimension of the observation
+LEARNING_RATE = 0.2  # α
+EXPLORATION = 0.1  # η of EXP3
+
+
+def every_visit_preferences(
+    environment: gymnasium.Env, expert: Expert, *, answers: int, seed: int, max_steps: int | None = None
+) -> Iterator[Step]:
+    """Ask `answers` questions; yields a step with a `GridPolicy` after each.
+
+    Args:
+      environment: observations in a bounded `Box`, actions in a bounded `Box` of one dimension.
+      expert: answers.
+      answers: how many, each on two new trajectories.
+      seed: of everything random.
+      max_steps: of a trajectory; None: the environment's limit.
+
+    Raises:
+      ValueError: other spaces.
+    """
+    policy = GridPolicy.initial(environment)
+    cells, actions = np.asarray(policy.table).shape
+    better = np.full((cells, actions, actions), 0.5)  # P(a ≻ a′ | s)
+    gains = np.zeros((cells, actions))  # of EXP3
+    pairs = 0
+    for number in range(1, answers + 1):
+        keys = jax.random.split(jax.random.key(int(np.random.default_rng([seed, number]).integers(2**31))))
+        exploring, greedy = exp3(gains), best_actions(better)
+        first = rollouts.rollout(
+            environment, policy.with_table(exploring), key=keys[0], episodes=1, max_steps=max_steps
+        )
+        seen = np.isin(np.arange(cells), policy.cells(first[0].states[:-1]))
+        mixed = policy.with_table(np.where(seen[:, None], exploring, greedy))
+        second = rollouts.rollout(environment, mixed, key=keys[1], episodes=1, max_steps=max_steps)
+        shown = [first[0], second[0]]
+        answer = parse_answer(expert(*shown))
+        if answer in (Answer.FIRST, Answer.SECOND):
+            visited = [(policy.cells(each.states[:-1]), policy.numbers(each.actions)) for each in shown]
+            preferred, other = visited if answer is Answer.FIRST else visited[::-1]
+            better += LEARNING_RATE * (sampled(preferred, other, better) - better)
+            gains += action_values(better) / exploring
+            pairs += 1
+        yield Step(number, pairs, policy.with_table(best_actions(better)))
+
+
+Visits = tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]  # cells and numbers of actions
+
+
+def sampled(preferred: Visits, other: Visits, before: Float[np.ndarray, "c a a"]) -> Float[np.ndarray, "c a a"]:
+    """P(a ≻ a′ | s) by one preference: (n+1)/2n for actions of the preferred trajectory against those of the other.
+
+    Args:
+      preferred, other: what the two trajectories visited.
+      before: kept where the two say nothing.
+    """
+    number, actions = before.shape[:2]
+    counts = [np.zeros((number, actions)) for _ in range(2)]
+    for count, visited in zip(counts, (preferred, other), strict=True):
+        np.add.at(count, visited, 1)
+    shared = max(1, int(np.sum(counts[0].any(axis=1) & counts[1].any(axis=1))))
+    wins = counts[0][:, :, None] * counts[1][:, None, :]  # pairs of visits with a of the preferred and a′ of the other
+    losses = wins.transpose(0, 2, 1)
+    said = (wins + losses > 0) & ~np.eye(actions, dtype=bool)
+    mean = 0.5 + (wins - losses) / np.maximum(wins + losses, 1) / (2 * shared)
+    return np.where(said, mean, before)
+
+
+def action_values(better: Float[np.ndarray, "c a a"]) -> Float[np.ndarray, "c a"]:
+    """The probability that an action is the best: 1 / (Σ_{a′≠a} 1/P(a ≻ a′) − (A − 2)) (Price et al. 1994)."""
+    actions = better.shape[-1]
+    inverse = np.where(np.eye(actions, dtype=bool), 0.0, 1 / np.maximum(better, 1e-12))
+    return 1 / (inverse.sum(axis=-1) - (actions - 2))
+
+
+def exp3(gains: Float[np.ndarray, "c a"], exploration: float = EXPLORATION) -> Float[np.ndarray, "c a"]:
+    """The probabilities of EXP3: a share η uniform, the rest ∝ exp(η/A · gains)."""
+    actions = gains.shape[1]
+    powers = exploration / actions * (gains - gains.max(axis=1, keepdims=True))
+    return exploration / actions + (1 - exploration) * np.exp(powers) / np.exp(powers).sum(axis=1, keepdims=True)
+
+
+def best_actions(better: Float[np.ndarray, "c a a"]) -> Float[np.ndarray, "c a"]:
+    """The greedy policy: equal probability for all actions of the highest value."""
+    values = action_values(better)
+    best = values >= values.max(axis=1, keepdims=True) - 1e-12
+    return best / best.sum(axis=1, keepdims=True)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class GridPolicy:
+    """π(a|s) = table[cell of s, a] for a few actions, on a grid of equal cells.
+
+    Attributes:
+      table: probabilities, rows sum to one.
+      low, high: bounds of the observations.
+      actions: the values of the actions, shape (A, 1).
+      per_dimension: cells along each dimension.
+    """
+
+    table: Float[AnyArray, "c a"]
+    low: Float[AnyArray, " s"]
+    high: Float[AnyArray, " s"]
+    actions: Float[AnyArray, "a 1"]
+    per_dimension: int = field(metadata={"static": True})
+
+    @classmethod
+    def initial(cls, environment: gymnasium.Env) -> "GridPolicy":
+        """The uniform policy for an environment; `ValueError` unless its spaces are bounded boxes."""
+        seen, acts = environment.observation_space, environment.action_space
+        for name, space in (("observations", seen), ("actions", acts)):
+            if not (isinstance(space, Box) and space.is_bounded() and len(space.shape) == 1):
+                raise ValueError(f"baseline epmc: expected {name} in a bounded Box of shape (n,), got {space}")
+        assert isinstance(seen, Box)
+        assert isinstance(acts, Box)
+        if acts.shape != (1,):
+            raise ValueError(f"baseline epmc: expected actions of one dimension, got {acts.shape[0]}")
+        values = np.linspace(acts.low.astype(float), acts.high.astype(float), 3)
+        table = np.full((CELLS ** seen.shape[0], len(values)), 1 / len(values))
+        return cls(table, seen.low.astype(float), seen.high.astype(float), values, CELLS)
+
+    def with_table(self, table: Float[np.ndarray, "c a"]) -> "GridPolicy":
+        """The same cells and actions with other probabilities."""
+        return GridPolicy(table, self.low, self.high, self.actions, self.per_dimension)
+
+    def cells(self, observations: Float[AnyArray, "... s"]) -> Any:
+        """The number of the cell of each observation."""
+        share = (jnp.asarray(observations) - self.low) / (jnp.asarray(self.high) - self.low)
+        places = jnp.clip((share * self.per_dimension).astype(int), 0, self.per_dimension - 1)
+        return places @ (self.per_dimension ** jnp.arange(places.shape[-1]))
+
+    def numbers(self, actions: Float[np.ndarray, "t 1"]) -> Int[np.ndarray, " t"]:
+        """The number of each action taken."""
+        return np.argmin(np.abs(actions - np.asarray(self.actions)[:, 0]), axis=1)
+
+    def sample(self, key: Key[Array, ""], observation: Float[AnyArray, " s"]) -> Float[Array, "1"]:
+        """a ~ π(·|s)."""
+        chances = jnp.asarray(self.table)[self.cells(observation)]
+        return jnp.asarray(self.actions)[jax.random.categorical(key, jnp.log(chances))]

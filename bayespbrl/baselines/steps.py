@@ -1,0 +1,17 @@
+"""What a baseline yields after each answer."""
+
+from typing import Any, NamedTuple
+
+
+class Step(NamedTuple):
+    """Where a baseline stands after an answer.
+
+    Attributes:
+      answers: number of answers so far, ties included.
+      pairs: those that stated a preference.
+      policy: what it would act by now.
+    """
+
+    answers: int
+    pairs: int
+    policy: Any

@@ -1,0 +1,117 @@
+"""The paper's sampler: one chain of plain elliptical slices, its first half discarded, without a check of convergence.
+
+To see what convergence is good for. Each move goes round an ellipse of the prior, from a start at a draw of the prior.
+The moves are made in the coordinates that the answers determine, where they have the same law as in all D dimensions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jax import Array, lax
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from bayespbrl import checks
+from bayespbrl.models.chains import Chains
+from bayespbrl.models.convergence import chain_convergence
+from bayespbrl.models.elliptical_slice import Ellipse
+from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords
+from bayespbrl.models.evidence import log_evidence
+from bayespbrl.models.gaussian_fit import fit_gaussian, one_blas_thread
+from bayespbrl.models.gibbs import conditional
+from bayespbrl.models.likelihoods import log_prob
+from bayespbrl.models.posterior_tree import margins_of, posterior_tree, settings_of
+from bayespbrl.models.preference_model import NOTHING_ELSE, PreferenceModel
+from bayespbrl.models.preference_problem import PreferenceProblem, low_rank_model, prior_ellipse
+
+LEAST = 16  # draws: half of them are kept, and R̂ needs twice four
+# Decision: of the second half so many draws are kept, equally far apart; the moves between them are not stored.
+KEPT = 1000
+
+
+def plain_draws(
+    differences: ArrayLike,
+    model: PreferenceModel,
+    *,
+    draws: int,
+    seed: int,
+    number_of_preferences: int | None = None,
+) -> xr.DataTree:
+    """As `posterior_draws`, by so many plain moves of one chain, of which the first half is discarded.
+
+    Args:
+      differences: ψ(preferred) − ψ(dominated), shape (K, D), or (1, K, D).
+      model: steepness and lapse rate given.
+      draws: moves in all, >= 16; the paper makes 200 000.
+      seed: of all draws.
+      number_of_preferences: K of eq. 8; all rows by default.
+
+    Raises:
+      ValueError: several settings of the features; a model that leaves something to be inferred.
+    """
+    draws, seed = checks.whole("draws", draws, LEAST), checks.whole("seed", seed, 0)
+    settings = settings_of(differences)
+    if len(settings) > 1 or model.steepness is None or model.lapse_rate is None:
+        raise ValueError("plain draws: expected given length scales, steepness and lapse rate, got some to be inferred")
+    number = settings.shape[1] if number_of_preferences is None else number_of_preferences
+    fits = [fit_gaussian(settings[0], model, number_of_preferences=number)]
+    half = draws // 2
+    kept = min(half, KEPT)
+    with jax.enable_x64(True), one_blas_thread():
+        chains = Chains.start(fits, num_chains=1, chunk=kept, seed=seed)
+        problem = conditional(chains.problem, jax.tree.map(lambda x: x[0], chains.unknowns))
+        start = model.prior_scale * np.random.default_rng([seed, 5]).standard_normal(problem.loadings.shape[1])
+        state = KERNEL.init(jax.random.key(seed), 0, {"utility_weights": start}, (problem,))
+        recorded = _moves(state, problem, draws - half, half // kept, length=kept)
+        chains = replace(chains, draws=(_part(chains, *map(np.asarray, recorded)),))
+        margins = margins_of(fits, chains, kept)[:, : kept // 2 * 2]
+        report = chain_convergence(margins.reshape(2, kept // 2, -1))  # its halves as chains
+        evidence = log_evidence(chains, kept, seed=seed)
+    attributes = {
+        "number_of_preferences": int(number),
+        "seed": seed,
+        "log_evidence": evidence[0],
+        "log_evidence_error": evidence[1],
+    }
+    return posterior_tree(fits, chains, kept, report, attributes, np.asarray(differences), NOTHING_ELSE)
+
+
+def _part(chains: Chains, z: np.ndarray, log_p: np.ndarray, *flags: np.ndarray) -> dict[str, np.ndarray]:
+    """Draws as `Chains` keeps them, of one chain."""
+    named = dict(zip(("candidates", "stuck", "diverging"), flags, strict=True))
+    rows = {"coordinates": z[:, : chains.rank], "answers": log_p[:, : chains.number], **named}
+    known = {name: np.repeat(np.asarray(value), len(z), axis=0) for name, value in chains.unknowns._asdict().items()}
+    return {name: value[None] for name, value in (rows | known).items()}
+
+
+def _ellipses(model_args: Args, model_kwargs: Keywords) -> Sequence[tuple[Ellipse, int]]:
+    return [(prior_ellipse(model_args[0]), 1)]
+
+
+KERNEL = EllipticalSlice(low_rank_model, batch=8, ellipses=_ellipses)
+
+
+@partial(jax.jit, static_argnames="length", compiler_options={"xla_backend_optimization_level": 1})
+def _moves(
+    state: EllipticalSliceState, problem: PreferenceProblem, burn_in: Array, between: Array, *, length: int
+) -> tuple[Float[Array, "n q"], Float[Array, "n k"], Array, Array, Array]:
+    """`length` draws after `burn_in` moves, each after `between` more: z, log p of each answer, and the flags."""
+
+    def after(state: EllipticalSliceState, moves: Array) -> EllipticalSliceState:
+        moved: EllipticalSliceState = lax.fori_loop(0, moves, lambda _, now: KERNEL.sample(now, (problem,), {}), state)
+        return moved
+
+    def step(state: EllipticalSliceState, _: None) -> tuple[EllipticalSliceState, tuple[Array, ...]]:
+        state = after(state, between)
+        z = state.z["utility_weights"]
+        log_p = log_prob(problem.likelihood, problem.loadings @ z)
+        return state, (z, log_p, jnp.asarray(state.candidates), state.stuck, state.diverging)
+
+    _, recorded = lax.scan(step, after(state, burn_in), None, length=length)
+    z, log_p, candidates, stuck, diverging = recorded
+    return z, log_p, candidates, stuck, diverging

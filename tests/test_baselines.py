@@ -1,0 +1,218 @@
+"""The baselines: PF's error model, planner, posterior and choice; EPMC's estimates and policy; both as cells."""
+
+import itertools
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+from test_trials import without_processes
+
+from bayespbrl.baselines import epmc, every_visit_preferences, pf, programming_by_feedback
+from bayespbrl.envs.gridworld import DYNAMICS, REWARDS, START
+from bayespbrl.experts import MarginExpert, ReturnExpert
+from bayespbrl.rollouts import open_environment
+from bayespbrl.studies import Study
+from bayespbrl.studies.baseline_trials import read_baseline
+from bayespbrl.studies.declaration import parsed
+
+
+def small_problem(seed=0, states=4, actions=2):
+    rng = np.random.default_rng(seed)
+    return rng.dirichlet(np.ones(states), (states, actions)), rng.normal(size=(3, states))
+
+
+def test_the_error_model_is_the_experts_and_the_average_over_its_threshold():
+    expert = MarginExpert(0.25)
+    for margin in (0.01, 0.1, 0.2, 0.3):
+        right = pf.preferred_probability(margin, 0.25)
+        assert right == pytest.approx(1 - expert.error_probability(margin))
+        assert pf.preferred_probability(-margin, 0.25) == pytest.approx(1 - right)
+        thresholds = np.linspace(0, 0.25, 200_001)[1:]
+        assert right == pytest.approx(np.mean(np.minimum(1, 0.5 + margin / thresholds / 2)), abs=1e-4)
+    assert pf.preferred_probability(np.array([0.0, 1.0, -1.0])).tolist() == [0.5, 1.0, 0.0]
+
+
+def test_the_planner_finds_the_best_of_all_policies():
+    table, utilities = small_problem()
+    states = np.arange(4)
+    for found, utility in zip(pf.planned(table, utilities, 0.9), utilities, strict=True):
+
+        def value(policy, utility=utility):
+            moves = table[states, list(policy)]
+            return np.linalg.solve(np.eye(4) - 0.9 * moves, moves @ utility)
+
+        best = np.max([value(policy) for policy in itertools.product(range(2), repeat=4)], axis=0)
+        np.testing.assert_allclose(value(found), best)
+
+
+def test_the_planner_is_value_iteration_on_the_gridworld():
+    table, reward = DYNAMICS.transition_table(), REWARDS.ravel()
+    q = np.zeros((25, 5))
+    for _ in range(2000):
+        q = table @ (reward + 0.98 * q.max(axis=1))
+    actions = pf.planned(table, reward[None])[0]
+    np.testing.assert_allclose(q[np.arange(25), actions], q.max(axis=1))
+    share = pf.expected_visits(table, actions[None], start=START, steps=300)[0]
+    assert 300 * share @ reward == pytest.approx(DYNAMICS.optimal_return, rel=1e-3)
+    assert share.sum() == pytest.approx(1.0)
+
+
+def test_the_posterior_is_that_of_rejection_and_prefers_what_is_consistent():
+    rng = np.random.default_rng(3)
+    differences = np.array([[0.3, -0.1, 0.0], [0.05, 0.1, -0.1]])
+    log_p = pf.log_likelihood(differences)
+    points = pf.moved(rng.standard_normal((4000, 3)), log_p, rng, moves=20)
+    prior = rng.standard_normal((60_000, 3))
+    kept = prior[rng.uniform(size=len(prior)) < np.exp(log_p(prior))]
+    for of in (pf.unit, lambda x: np.abs(pf.unit(x))):
+        np.testing.assert_allclose(of(points).mean(axis=0), of(kept).mean(axis=0), atol=0.03)
+    assert np.mean(points @ differences[0] > 0) > 0.9
+    assert np.mean(prior @ differences[0] > 0) == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_question_has_the_highest_expected_utility_of_selection():
+    table, weights = small_problem(5)
+    best = np.array([0.4, 0.3, 0.2, 0.1])
+    candidates = {tuple(policy) for policy in pf.planned(table, np.vstack([weights, weights.mean(axis=0)]))}
+    assert len(candidates) > 1
+
+    def expected(policy):
+        share, now = np.zeros(4), np.eye(4)[0]
+        for _ in range(50):
+            now = now @ table[np.arange(4), list(policy)]
+            share += now / 50
+        total = 0.0
+        for w in weights:
+            wins = float(pf.preferred_probability(w @ (share - best)))
+            total += wins * (w @ share) + (1 - wins) * (w @ best)
+        return total
+
+    found = pf.chosen(table, weights, best, start=0, steps=50)
+    assert tuple(found) == max(candidates, key=expected)
+
+
+@pytest.mark.slow
+def test_pf_learns_from_the_answers_and_not_without_them(monkeypatch):
+    monkeypatch.setattr(pf, "DRAWS", 40)
+    monkeypatch.setattr(pf, "MOVES", 15)
+    environment = open_environment("gridworld")
+
+    def value(expert, seed):
+        *_, last = programming_by_feedback(environment, expert, answers=8, seed=seed, max_steps=100)
+        assert last.answers == 8
+        assert last.pairs <= 8
+        policy = np.asarray(last.policy.table).argmax(axis=1)
+        share = pf.expected_visits(DYNAMICS.transition_table(), policy[None], start=START, steps=100)[0]
+        return share @ REWARDS.ravel()
+
+    honest = [value(ReturnExpert(), seed) for seed in (1, 2, 3)]
+    contrary = [value(lambda a, b: ReturnExpert()(b, a), seed) for seed in (1, 2, 3)]
+    assert np.median(honest) > 0.4 > 0.1 > np.median(contrary)
+    assert value(ReturnExpert(), 1) == honest[0]
+    assert next(programming_by_feedback(environment, lambda a, b: "tie", answers=1, seed=1)).pairs == 0
+
+
+def test_baselines_refuse_tasks_that_are_not_theirs():
+    with pytest.raises(ValueError, match="baseline pf: expected a task with a known transition_table"):
+        next(programming_by_feedback(open_environment("swing-up"), ReturnExpert(), answers=1, seed=0))
+    with pytest.raises(ValueError, match="baseline epmc: expected observations in a bounded Box"):
+        next(every_visit_preferences(open_environment("gridworld"), ReturnExpert(), answers=1, seed=0))
+
+
+def test_a_preference_says_the_more_the_fewer_states_both_visited():
+    before = np.full((3, 2, 2), 0.5)
+    one = epmc.sampled(([0], [1]), ([0], [0]), before)
+    assert one[0].tolist() == [[0.5, 0.0], [1.0, 0.5]]
+    assert one[1:].tolist() == before[1:].tolist()
+    two = epmc.sampled(([0, 1], [1, 1]), ([0, 1], [0, 1]), before)
+    assert two[0].tolist() == [[0.5, 0.25], [0.75, 0.5]]
+    assert two[1].tolist() == before[1].tolist()  # the same action says nothing
+    # visits that contradict each other are averaged: twice for the action 1, once against it
+    both = epmc.sampled(([0, 0], [1, 1]), ([0, 0, 0], [0, 0, 1]), before)
+    assert both[0, 1, 0] == 1.0
+    mixed = epmc.sampled(([0, 0, 0], [1, 1, 0]), ([0, 0], [0, 1]), before)
+    assert mixed[0, 1, 0] == pytest.approx(0.5 + (2 - 1) / 3 / 2)
+    assert mixed[0, 0, 1] == pytest.approx(1 - mixed[0, 1, 0])
+
+
+def test_the_better_of_two_arms_is_found_in_spite_of_wrong_answers():
+    rng, better, gains = np.random.default_rng(0), np.full((1, 2, 2), 0.5), np.zeros((1, 2))
+    for _ in range(300):
+        arms = rng.choice(2, size=2, p=epmc.exp3(gains)[0])
+        order = arms if (arms[0] > arms[1]) == (rng.uniform() < 0.8) else arms[::-1]
+        found = epmc.sampled(([0], [order[0]]), ([0], [order[1]]), better)
+        better = better + 0.05 * (found - better)
+        gains += epmc.action_values(better)
+    assert better[0, 1, 0] == pytest.approx(0.8, abs=0.15)
+    assert epmc.best_actions(better).tolist() == [[0.0, 1.0]]
+    assert epmc.exp3(gains)[0, 1] > 0.6
+    assert epmc.exp3(gains).sum() == pytest.approx(1)
+    assert epmc.exp3(gains).min() >= epmc.EXPLORATION / 2
+
+
+def test_values_of_actions_are_those_of_pairwise_coupling():
+    strengths = np.array([0.2, 0.3, 0.5])
+    better = (strengths[:, None] / (strengths[:, None] + strengths))[None]  # Bradley and Terry's: coupling is exact
+    np.testing.assert_allclose(epmc.action_values(better), [strengths])
+    assert epmc.best_actions(np.full((1, 3, 3), 0.5)).tolist() == [[1 / 3] * 3]
+
+
+class Push(gymnasium.Env):
+    """The return is the sum of the actions; observations are the time."""
+
+    observation_space, action_space = Box(0, 1, (1,)), Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.time += 1
+        return np.full(1, self.time / 4, np.float32), float(action[0]), False, self.time >= 4, {}
+
+
+@pytest.mark.slow
+def test_epmc_learns_which_action_is_the_best():
+    *_, last = every_visit_preferences(Push(), ReturnExpert(), answers=40, seed=4, max_steps=4)
+    assert last.answers == 40
+    assert 15 < last.pairs <= 40
+    table = np.asarray(last.policy.table)
+    visited = np.asarray(last.policy.cells(np.array([[0.0], [0.25], [0.5], [0.75]])))
+    assert np.asarray(last.policy.actions)[:, 0].tolist() == [-1, 0, 1]
+    assert table[visited].argmax(axis=1).tolist().count(2) >= 3
+    assert next(every_visit_preferences(Push(), lambda a, b: "tie", answers=1, seed=0, max_steps=4)).pairs == 0
+
+
+DECLARATION = """
+seed = 2985
+trials = 1
+[options]
+preset = "paper"
+iterations = 2
+max_steps = 20
+evaluation_episodes = 2
+[tasks.gridworld]
+[methods.pf]
+baseline = "pf"
+"""
+
+
+@pytest.mark.slow
+def test_a_baseline_is_a_cell_of_a_study_with_a_line_for_each_answer(tmp_path, monkeypatch):
+    monkeypatch.setattr(pf, "DRAWS", 20)
+    without_processes(monkeypatch)
+    study = Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "tiny")
+    assert study.run() == []
+    lines = (tmp_path / "tiny" / "iterations.csv").read_text().splitlines()
+    assert [line.split(",")[6] for line in lines[1:]] == ["1", "2", "3"]  # two answers first, then one an iteration
+    again = Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "tiny")
+    assert again.finished == 1
+    file = tmp_path / "tiny/gridworld/pf/seed-2985/baseline.json"
+    file.write_text(json.dumps({"iterations": []}))
+    with pytest.raises(ValueError, match="expected the values of a baseline"):
+        read_baseline(file.parent)
+    with pytest.raises(ValueError, match=r"methods\.pf, baseline: expected one of pf, epmc"):
+        parsed(DECLARATION.replace('baseline = "pf"', 'baseline = "dqn"'), "tiny")
