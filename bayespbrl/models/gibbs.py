@@ -116,6 +116,8 @@ def moved(
         z, unknowns = _setting_move(keys[0], z, unknowns, problem)
     if problem.fitted_steepness is not None:
         z, unknowns = _steepness_move(random.fold_in(key, 0), z, unknowns, problem)
+    if len(problem.tie_threshold.values) > 1:
+        z, unknowns = _threshold_move(random.fold_in(key, 1), z, unknowns, problem)
     margins = problem.settings.loadings[unknowns.setting] @ z
     for key, name in zip(keys[1:], ("steepness", "lapse_rate", "tie_threshold"), strict=True):
         prior: Table = getattr(problem, name)
@@ -148,18 +150,43 @@ def _steepness_move(
 ) -> tuple[Float[Array, " q"], Unknowns]:
     """Steepness m and weights z m₀/m drawn together, so that their product stays.
 
-    Many answers determine the product well, and neither m given z nor z given m could then move. Its r coordinates that
-    are no padding are scaled, which has the volume (m₀/m)^r.
+    Many answers determine the product well, and neither m given z nor z given m could then move.
     """
-    values, loadings = problem.steepness.values, problem.settings.loadings[unknowns.setting]
-    scales = values[unknowns.steepness] / values
-    scaled = jnp.any(loadings != 0, axis=0)
-    points = jnp.where(scaled, scales[:, None] * z, z)
+    values = problem.steepness.values
     every = _point(problem, unknowns)._replace(steepness=values[:, None])
-    log_p = jnp.sum(_log_probabilities(problem, every, points @ loadings.T), axis=1)
-    log_p += problem.steepness.log_probabilities - 0.5 * jnp.sum(points**2, axis=1) / problem.settings.prior_scale**2
+    log_p = problem.steepness.log_probabilities
+    z, chosen = _scaled(key, z, values[unknowns.steepness] / values, every, log_p, unknowns, problem)
+    return z, unknowns._replace(steepness=chosen)
+
+
+def _threshold_move(
+    key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem
+) -> tuple[Float[Array, " q"], Unknowns]:
+    """Tie threshold δ and weights z δ/δ₀ drawn together: which answers are ties determines their ratio well."""
+    values = problem.tie_threshold.values
+    every = _point(problem, unknowns)._replace(tie_threshold=values[:, None])
+    log_p = problem.tie_threshold.log_probabilities
+    z, chosen = _scaled(key, z, values / values[unknowns.tie_threshold], every, log_p, unknowns, problem)
+    return z, unknowns._replace(tie_threshold=chosen)
+
+
+def _scaled(
+    key: PRNGKeyArray,
+    z: Float[Array, " q"],
+    scales: Values,
+    every: _Point,
+    log_prior: Values,
+    unknowns: Unknowns,
+    problem: JointProblem,
+) -> tuple[Float[Array, " q"], Int[Array, ""]]:
+    """One of the points of `every`, each with the weights scaled as it says: r coordinates have the volume scale^r."""
+    loadings = problem.settings.loadings[unknowns.setting]
+    scaled = jnp.any(loadings != 0, axis=0)  # all but padding
+    points = jnp.where(scaled, scales[:, None] * z, z)
+    log_p = jnp.sum(_log_probabilities(problem, every, points @ loadings.T), axis=1) + log_prior
+    log_p -= 0.5 * jnp.sum(points**2, axis=1) / problem.settings.prior_scale**2
     chosen = random.categorical(key, log_p + jnp.sum(scaled) * jnp.log(scales))
-    return points[chosen], unknowns._replace(steepness=chosen)
+    return points[chosen], chosen
 
 
 def log_likelihood(problem: JointProblem, unknowns: Unknowns, margins: Margins) -> Values:

@@ -212,13 +212,18 @@ class WithTies:
     indifferent: Bool[Array, "*b k"] | Bool[np.ndarray, "*b k"]
 
     def factor(self, margins: Margins) -> tuple[Values, Values]:
-        """q = 1: the logarithms of both terms of a tie are needed."""
-        preferred = log_prob(self.ordered, margins - self.threshold)
+        """Of a tie e is that of the upper term times δ / (1 + δ): q, what the lower one leaves, cannot underflow."""
         # p(tie) is symmetric: at −|t| both terms are small and their difference keeps its relative precision
-        upper = log_prob(self.ordered, self.threshold - jnp.abs(margins))
-        lower = log_prob(self.ordered, -self.threshold - jnp.abs(margins))
-        exponent = jnp.where(self.indifferent, upper + jnp.log(-jnp.expm1(lower - upper)), preferred)
-        return exponent, jnp.ones_like(exponent)
+        below = -jnp.abs(margins)
+        exponent, ratio = self.ordered.factor(
+            jnp.where(self.indifferent, below + self.threshold, margins - self.threshold)
+        )
+        lower, of_lower = self.ordered.factor(below - self.threshold)
+        scale = 1 + 1 / jnp.asarray(self.threshold)
+        left = jnp.maximum(ratio - jnp.exp(lower - exponent) * of_lower, 0) * scale
+        return jnp.where(self.indifferent, exponent - jnp.log(scale), exponent), jnp.where(
+            self.indifferent, left, ratio
+        )
 
     def probit_mixture(self) -> ProbitMixture:
         """Weights (K, 2J): an ordered answer uses the half shifted by δ, a tie the difference of both."""
