@@ -13,7 +13,7 @@ Decisions, where the sources are silent or differ:
 * The mean over all pairs of visits of a cell is one sample for it.
 * A tie changes nothing.
 * After an answer the learner would act by the greedy policy, any of the best actions with equal probability.
-* Learning rate, exploration and the number of cells were chosen among five on seeds 0 to 7, after 75 answers.
+* Learning rate, exploration and the number of cells were chosen among a few on seeds 0 to 7, after 75 answers.
 """
 
 from collections.abc import Iterator
