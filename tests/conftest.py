@@ -83,3 +83,27 @@ def swing_up_run(swing_up_learner):
 def swing_up_copy(swing_up_run, tmp_path):
     """A copy of `swing_up_run`, without its reports, to be changed."""
     return Path(shutil.copytree(swing_up_run, tmp_path / "copy", ignore=shutil.ignore_patterns("report*")))
+
+
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """The system's Chromium, headless."""
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium")
+    assert chromium, "no chromium on the PATH: install it, for example with `apt-get install chromium`"
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield started
+        started.close()

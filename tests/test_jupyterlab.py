@@ -2,27 +2,16 @@
 
 import json
 import re
-import shutil
 import socket
 import subprocess
 import sys
 import urllib.request
 
 import pytest
-from toys import QUICK
+from toys import QUICK, READY
 
 import bayespbrl
 
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-READY = ".bp-box[data-phase=question][data-locked=false]"
 KEYS = {"first": "ArrowLeft", "second": "ArrowRight", "tie": "ArrowDown"}
 CELLS = [
     f"import bayespbrl\nlearner = bayespbrl.start('gridworld', 'run', expert='other', **{QUICK!r})\nlearner.widget()",
@@ -57,38 +46,31 @@ def lab(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_scripted_person_answers_a_whole_run_in_jupyterlab(lab):
-    from playwright.sync_api import sync_playwright
-
-    chromium = shutil.which("chromium")
-    assert chromium, "no chromium on the PATH: install it, for example with `apt-get install chromium`"
+def test_a_scripted_person_answers_a_whole_run_in_jupyterlab(browser, lab):
     address, folder = lab
     expert = bayespbrl.ReturnExpert()
     plain = bayespbrl.Learner("gridworld", expert="other", **QUICK)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        opened = browser.new_page(viewport={"width": 1100, "height": 1000})
-        opened.set_default_timeout(120_000)  # milliseconds; machines may be busy
-        opened.goto(address)
-        opened.click(".jp-CodeCell .cm-content")
-        opened.wait_for_selector("[data-status=idle], .jp-Notebook-ExecutionIndicator[data-status=idle]")
-        opened.keyboard.press("Control+Enter")
-        opened.wait_for_selector(READY)
-        opened.click(".bp-ask")
-        while questions := plain.ask():
-            turn = opened.get_attribute(".bp-box", "data-turn")
-            answer = str(expert(*questions[0].trajectories))
-            opened.keyboard.press(KEYS[answer])
-            plain.tell([answer])
-            opened.wait_for_selector(f"{READY}:not([data-turn='{turn}']), .bp-box[data-phase=finished]")
-            if turn == "1":  # keys that JupyterLab would act on, and a cell while a question waits
-                for key in ("a", "b", "x", "z"):
-                    opened.keyboard.press(key)
-                opened.click(".jp-CodeCell >> nth=1 >> .cm-content")
-                opened.keyboard.press("Control+Enter")
-                opened.wait_for_selector("text=cells stay free")
-                opened.click(".bp-ask")
-        assert opened.locator(".jp-CodeCell").count() == len(CELLS)
-        assert re.search("4 answers", opened.inner_text(".bp-ask"))
-        browser.close()
+    opened = browser.new_page(viewport={"width": 1100, "height": 1000})
+    opened.set_default_timeout(120_000)  # milliseconds; machines may be busy
+    opened.goto(address)
+    opened.click(".jp-CodeCell .cm-content")
+    opened.wait_for_selector("[data-status=idle], .jp-Notebook-ExecutionIndicator[data-status=idle]")
+    opened.keyboard.press("Control+Enter")
+    opened.wait_for_selector(READY)
+    opened.click(".bp-ask")
+    while questions := plain.ask():
+        turn = opened.get_attribute(".bp-box", "data-turn")
+        answer = str(expert(*questions[0].trajectories))
+        opened.keyboard.press(KEYS[answer])
+        plain.tell([answer])
+        opened.wait_for_selector(f"{READY}:not([data-turn='{turn}']), .bp-box[data-phase=finished]")
+        if turn == "1":  # keys that JupyterLab would act on, and a cell while a question waits
+            for key in ("a", "b", "x", "z"):
+                opened.keyboard.press(key)
+            opened.click(".jp-CodeCell >> nth=1 >> .cm-content")
+            opened.keyboard.press("Control+Enter")
+            opened.wait_for_selector("text=cells stay free")
+            opened.click(".bp-ask")
+    assert opened.locator(".jp-CodeCell").count() == len(CELLS)
+    assert re.search("4 answers", opened.inner_text(".bp-ask"))
     assert bayespbrl.load(folder / "run").preferences == plain.preferences

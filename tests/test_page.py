@@ -4,7 +4,6 @@ import http.client
 import json
 import os
 import random
-import shutil
 import subprocess
 import sys
 import threading
@@ -14,38 +13,15 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from toys import QUICK, Slope, fingerprint
+from toys import QUICK, READY, Slope, fingerprint
 
 import bayespbrl
 from bayespbrl.people.page import LARGEST_BODY, Page
 from bayespbrl.people.session import Session
 
 pytestmark = pytest.mark.slow
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-READY = ".bp-box[data-phase=question][data-locked=false]"
 KEYS = {"first": "ArrowLeft", "second": "ArrowRight", "tie": "ArrowDown", "skip": "s", "undo": "u"}
 KILLS = int(os.environ.get("BAYESPBRL_KILLS", "2"))  # of the server, in the test of killed servers
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """The system's Chromium, headless."""
-    from playwright.sync_api import sync_playwright
-
-    chromium = shutil.which("chromium")
-    assert chromium, "no chromium on the PATH: install it, for example with `apt-get install chromium`"
-    with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started
-        started.close()
 
 
 @contextmanager

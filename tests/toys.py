@@ -15,6 +15,9 @@ QUICK = {
     "seed": 7,
 }
 
+# Selects the page or the widget while it waits for an answer.
+READY = ".bp-box[data-phase=question][data-locked=false]"
+
 
 class Slope(gymnasium.Env):
     """A point pushed along a line; goes wrong at the n-th step of its life if told so."""
