@@ -25,7 +25,7 @@ from bayespbrl.models.evidence import log_evidence
 from bayespbrl.models.gaussian_fit import fit_gaussian, one_blas_thread
 from bayespbrl.models.gibbs import conditional
 from bayespbrl.models.likelihoods import log_prob
-from bayespbrl.models.posterior_tree import margins_of, posterior_tree, settings_of
+from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, PreferenceModel
 from bayespbrl.models.preference_problem import PreferenceProblem, low_rank_model, prior_ellipse
 
@@ -72,12 +72,7 @@ def plain_draws(
         margins = margins_of(fits, chains, kept)[:, : kept // 2 * 2]
         report = chain_convergence(margins.reshape(2, kept // 2, -1))  # its halves as chains
         evidence = log_evidence(chains, kept, seed=seed)
-    attributes = {
-        "number_of_preferences": int(number),
-        "seed": seed,
-        "log_evidence": evidence[0],
-        "log_evidence_error": evidence[1],
-    }
+    attributes = fit_attributes(number, seed, evidence)
     return posterior_tree(fits, chains, kept, report, attributes, np.asarray(differences), NOTHING_ELSE)
 
 
@@ -96,7 +91,7 @@ def _ellipses(model_args: Args, model_kwargs: Keywords) -> Sequence[tuple[Ellips
 KERNEL = EllipticalSlice(low_rank_model, batch=8, ellipses=_ellipses)
 
 
-@partial(jax.jit, static_argnames="length", compiler_options={"xla_backend_optimization_level": 1})
+@partial(jax.jit, static_argnames="length")
 def _moves(
     state: EllipticalSliceState, problem: PreferenceProblem, burn_in: Array, between: Array, *, length: int
 ) -> tuple[Float[Array, "n q"], Float[Array, "n k"], Array, Array, Array]:

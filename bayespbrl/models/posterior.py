@@ -15,7 +15,7 @@ from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.evidence import log_evidence
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, one_blas_thread, refitted
 from bayespbrl.models.likelihoods import has_steps
-from bayespbrl.models.posterior_tree import margins_of, posterior_tree, settings_of
+from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
 
 # A setting that fewer draws have is not diagnosed: how many do is known too badly, and matters little.
@@ -157,12 +157,7 @@ def posterior_draws(
                 break
             wanted *= 2
         evidence = log_evidence(chains, wanted, seed=seed)
-    attributes = {
-        "number_of_preferences": int(number),
-        "seed": seed,
-        "log_evidence": evidence[0],
-        "log_evidence_error": evidence[1],
-    }
+    attributes = fit_attributes(number, seed, evidence)
     return posterior_tree(fits, chains, wanted, report, attributes, np.asarray(differences), answers)
 
 

@@ -42,6 +42,17 @@ def margins_of(fits: Sequence[GaussianFit], chains: Chains, length: int) -> Floa
     return margins
 
 
+def fit_attributes(number: int, seed: int, evidence: tuple[float, float]) -> dict[str, float]:
+    """What a tree states of its fit: K of eq. 8, the seed, the log marginal likelihood and its Monte Carlo error."""
+    log_evidence, error = evidence
+    return {
+        "number_of_preferences": int(number),
+        "seed": seed,
+        "log_evidence": log_evidence,
+        "log_evidence_error": error,
+    }
+
+
 def posterior_tree(
     fits: Sequence[GaussianFit],
     chains: Chains,
