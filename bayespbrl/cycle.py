@@ -17,10 +17,11 @@ from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement.check import Check, checked
+from bayespbrl.improvement.check import EPISODES, Check, checked
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
+from bayespbrl.policies import greedy
 from bayespbrl.preferences import opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
 from bayespbrl.settings import Settings
@@ -30,7 +31,7 @@ from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.inference import estimate
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT, CLIPS = range(11)
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT, CLIPS, CHECK = range(12)
 # Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
 HOLDS = 40  # of exploration, in an episode
@@ -89,7 +90,19 @@ class Cycle:
             **({} if clips is None else {"clips": clips}),
             "seconds": time.perf_counter() - began,
         }
-        return _entry(event, trajectories=collected)
+        return _entry(event, trajectories=collected, tried=self._tried(state.policy))
+
+    def _tried(self, policy: Any) -> tuple[Trajectory, ...]:
+        """Trajectories without the policy's noise, from starts that are the same for all policies of the run."""
+        if not self.settings.update.checked:
+            return ()
+        return rollouts.rollout(
+            self.environment,
+            greedy(policy),
+            key=self._key(CHECK, 0),
+            episodes=EPISODES,
+            max_steps=self.settings.rollouts.max_steps,
+        )
 
     def _hold(self, state: LearnerState) -> int:
         """For how many steps exploration is held: as set, or a share of an episode."""
@@ -176,16 +189,20 @@ class Cycle:
         return _entry(
             {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
             trajectories=state.trajectories[-options.trajectories_per_iteration :],
+            tried=state.tried,
             policy=improved.policy,
             estimate=utility,
         )
 
     def evaluated(self, policy: Any) -> rollouts.Returns:
-        """Fresh episodes, the same for all policies of the run; the learner never sees them."""
+        """Fresh episodes, the same for all policies of the run; the learner never sees them.
+
+        Where updates are checked, and the policy is kept without its noise, it is evaluated without.
+        """
         options = self.settings.rollouts
         return rollouts.returns(
             self.environment,
-            policy,
+            greedy(policy) if self.settings.update.checked else policy,
             key=self._key(EVALUATE, 0),
             episodes=options.evaluation_episodes,
             max_steps=options.max_steps,
@@ -201,12 +218,9 @@ class Cycle:
 
     def _check(self, state: LearnerState, utility: UtilityEstimate) -> Check:
         """Whether the newest policy is better than the best before it, by the trajectories of both."""
-        if state.iteration == 0:
-            return Check(0, 1.0)
-        newest, best = (
-            utility.trajectory_utilities([state.trajectories[i] for i in self._of_iteration(number)])
-            for number in (state.iteration, state.best)
-        )
+        if not state.best_tried:  # of the first iteration
+            return Check(state.iteration, state.trust)
+        newest, best = map(utility.trajectory_utilities, (state.tried, state.best_tried))
         return checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
 
     def estimate(self, state: LearnerState) -> UtilityEstimate:

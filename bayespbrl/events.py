@@ -35,7 +35,7 @@ class Entry:
 
     Attributes:
       event: plain data, one line of the log.
-      parts: `trajectories` of `collected`; `trajectories`, `policy` and `estimate` of `improved`.
+      parts: `trajectories` and `tried` of `collected`; these, `policy` and `estimate` of `improved`.
     """
 
     event: Mapping[str, Any]
@@ -56,7 +56,9 @@ class LearnerState:
       policy: the newest policy, which the next trajectories follow.
       best_policy: the policy that the run keeps: of all that were tried the one that the posterior thinks best where
         updates are checked, else the newest.
-      best: the number of the iteration whose trajectories followed the best policy, from 0.
+      best: the number of the iteration that tried the best policy, from 0.
+      tried, best_tried: trajectories of the newest and of the best policy without their noise, where updates are
+        checked; () where there are none.
       trust: share of the KL bound that the next update may use; it falls after a step back.
       estimate: the last utility estimate; None before the first.
       bound: the last decision on the KL bound; None before the first.
@@ -82,6 +84,8 @@ class LearnerState:
     policy: Any
     best_policy: Any = None
     best: int = 0
+    tried: tuple[Trajectory, ...] = ()
+    best_tried: tuple[Trajectory, ...] = ()
     trust: float = 1.0
     estimate: UtilityEstimate | None = None
     bound: Bound | None = None
@@ -149,6 +153,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
                 if tried_is_best
                 else state.best_policy,
                 best=state.iteration + 1 if check is None else operator.index(check["best"]),
+                best_tried=state.tried if tried_is_best else state.best_tried,
                 trust=1.0 if check is None else float(check["trust"]),
                 estimate=entry.parts["estimate"],
                 bound=Bound.recalled(event["summary"]["kl_bound"], event["summary"]["schedule"]),
@@ -227,6 +232,7 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     return replace(
         state,
         trajectories=state.trajectories + tuple(parts["trajectories"]),
+        tried=tuple(parts.get("tried", ())),
         clips=state.clips + clips_in(event),
         preferences=preferences,
         collected=True,

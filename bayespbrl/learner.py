@@ -14,7 +14,7 @@ from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
-from bayespbrl.policies import Policy
+from bayespbrl.policies import Policy, greedy
 from bayespbrl.policies.choice import initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
 from bayespbrl.settings import Settings, Task, settings_for
@@ -107,8 +107,8 @@ class Learner:
 
     @property
     def policy(self) -> Any:
-        """Of the policies that were tried, the one that the posterior thinks best; else the newest."""
-        return self.state.kept_policy
+        """The policy that the posterior thinks best of those tried, without its noise; else the newest, with it."""
+        return greedy(self.state.kept_policy) if self.settings.update.checked else self.state.kept_policy
 
     @property
     def last_policy(self) -> Any:

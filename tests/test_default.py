@@ -55,6 +55,24 @@ def test_the_kept_policy_is_the_best_that_was_tried_and_its_value_is_reported(ru
     assert run.learner.last_policy is run.learner.state.policy
 
 
+def test_a_policy_is_tried_without_its_noise_from_starts_that_all_policies_share(run):
+    tried, kept = run.learner.state.tried, run.learner.state.best_tried
+    for trajectory, other in zip(tried, kept, strict=True):
+        np.testing.assert_array_equal(trajectory.states[0], other.states[0])
+    best, last = run.iterations[-1]["check"]["best"], run.learner.state.iteration - 1
+    assert (best == last) == all(
+        np.array_equal(one.states, other.states) for one, other in zip(tried, kept, strict=True)
+    )
+    policy = run.learner.state.kept_policy
+    for trajectory in kept:
+        actions = [policy.mode(state) for state in trajectory.states[:-1]]
+        np.testing.assert_allclose(trajectory.actions, np.clip(actions, -1, 1), atol=1e-4)  # outside float64
+    observation = np.array([0.1, -0.2])
+    assert all(run.policy.act(observation) == run.policy.act(observation) for _ in range(3))
+    noisy = {run.last_policy.act(observation).item() for _ in range(5)}
+    assert len(noisy) == 5
+
+
 def test_a_step_back_goes_on_from_the_kept_policy_with_less_trust():
     """An estimate that calls the newest trajectories worse sends the next update back to the best policy."""
     learner = Learner(Slope(), answers=3, **FAST)
@@ -97,7 +115,7 @@ def test_a_stopped_run_of_the_default_goes_on_bit_for_bit(tmp_path):
 @pytest.mark.parametrize("env", ["swing-up", "Pendulum-v1", "CartPole-v1", "acrobot"])
 def test_equal_starts_give_equal_first_states_and_other_actions(env):
     environment = rollouts.open_environment(env)
-    policy = Learner(env, seed=1).policy
+    policy = Learner(env, seed=1).last_policy
     first, second = (
         rollout(environment, policy, key=jax.random.key(key), episodes=3, max_steps=5, starts=[7, 7, 8])
         for key in (1, 2)

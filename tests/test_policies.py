@@ -17,6 +17,7 @@ from bayespbrl.policies import (
     TabularPolicy,
     batch,
     entropies,
+    greedy,
     log_probabilities,
     sample_actions,
     softmax,
@@ -114,6 +115,16 @@ def test_sampled_actions_follow_log_prob(kind, fitted):
     else:
         deviation = fitted.action_standard_deviation(observation)[0]
         np.testing.assert_allclose(actions.std(axis=0), deviation, rtol=0.03)
+
+
+def test_the_mode_is_the_most_probable_action(kind, fitted):
+    observations = some_observations(kind, 5, np.random.default_rng(3))
+    chosen = sample_actions(greedy(fitted), jax.random.key(0), observations)
+    np.testing.assert_array_equal(chosen, sample_actions(greedy(fitted), jax.random.key(1), observations))
+    highest = log_probabilities(fitted, observations, chosen)
+    for key in range(20):
+        others = sample_actions(fitted, jax.random.key(key), observations)
+        assert np.all(log_probabilities(fitted, observations, others) <= highest + 1e-9)
 
 
 def test_a_row_depends_on_the_key_and_its_number_alone(kind, fitted):

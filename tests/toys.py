@@ -50,7 +50,8 @@ def fingerprint(learner):
         "summaries": [{k: v for k, v in s.items() if k != "seconds"} for s in learner.iterations],
         "policy": [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
         "trajectories": [
-            (t.states.tobytes(), t.actions.tobytes(), t.rewards.tobytes(), t.terminated) for t in learner.trajectories
+            (t.states.tobytes(), t.actions.tobytes(), t.rewards.tobytes(), t.terminated)
+            for t in (*learner.trajectories, *learner.state.tried, *learner.state.best_tried)
         ],
         "preferences": learner.preferences,
         "weights": None if learner.estimate is None else np.asarray(learner.estimate.weights).tobytes(),

@@ -1,7 +1,8 @@
 """Whether an update was a step forward: the newest policy beside the best one, by the utility of their trajectories.
 
-An update follows an estimate of Q. The trajectories after it show what it did, and the posterior, not the hidden
-reward, says whether that is better. After a step back the run goes on from the best policy, with smaller updates.
+An update follows an estimate of Q. Trajectories of the policy after it show what it did, and the posterior, not the
+hidden reward, says whether that is better. They are without the policy's noise and start alike for all policies, so
+that neither luck nor exploration decides. After a step back the run goes on from the best policy, with smaller updates.
 """
 
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+EPISODES = 8  # of each policy
 LEAST_TRUST = 0.05
 STANDARD_ERRORS = 1.0  # by which the newest policy has to be worse for a step back
 
@@ -18,7 +20,7 @@ class Check:
     """The result for one iteration.
 
     Attributes:
-      best: number of the iteration whose trajectories followed the best policy so far, from 0.
+      best: number of the iteration that tried the best policy so far, from 0.
       trust: share of the KL bound that the next update may use.
       stepped_back: whether the run goes on from the best policy rather than from the newest.
       gain, standard_error: mean difference of the utilities of the trajectories, newest minus best, and its error.
@@ -35,8 +37,8 @@ def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, tru
     """The check of one update.
 
     Args:
-      differences: utility of each of the newest policy's trajectories minus that of the best one's, pair by pair from
-        the same start where there is one.
+      differences: utility of each of the newest policy's trajectories minus that of the best one's from the same
+        start.
       newest, best: numbers of the iterations of both.
       trust: so far; it is doubled, up to 1, after a step forward and halved after a step back.
     """

@@ -34,8 +34,9 @@ class PolicyUpdate:
       recent_iterations: the update takes the states of so many last iterations; None for those of all.
       critic_iterations: LSTD takes the transitions of so many last iterations, but at least `LEAST_TRANSITIONS` and at
         most `MOST_TRANSITIONS`; None for those of all, as in the paper. Old ones say little of the current policy.
-      checked: whether each update is checked by the trajectories that follow it: the run keeps the policy that the
-        posterior thinks best, and goes on from there after a step back. The paper's learner never looks back.
+      checked: whether each update is checked by trajectories of the policy without its noise: the run keeps the policy
+        that the posterior thinks best, without noise, and goes on from there after a step back. The paper's learner
+        never looks back.
       update_states: most of these states that the update takes, drawn at random, where they are continuous: it bounds
         time and memory for long episodes.
     """

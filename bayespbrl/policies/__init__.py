@@ -4,11 +4,13 @@ policy                   the protocol that all follow; choice says which suits a
 tabular, softmax, linear_gaussian, gaussian_process
 sparse_regression        the weighted FITC regression of the Gaussian process
 hyperparameter_search    its bandwidths and variances by CMA-ES
+greedy                   a policy without its noise
 batch, actor             a policy at many observations, and at one
 """
 
 from bayespbrl.policies.batch import entropies, log_probabilities, sample_actions
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
+from bayespbrl.policies.greedy import greedy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
 from bayespbrl.policies.policy import Policy, is_discrete
 from bayespbrl.policies.softmax import SoftmaxPolicy
@@ -23,6 +25,7 @@ __all__ = [
     "TabularPolicy",
     "clipped",
     "entropies",
+    "greedy",
     "is_discrete",
     "log_probabilities",
     "sample_actions",

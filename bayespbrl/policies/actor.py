@@ -11,7 +11,8 @@ from gymnasium.spaces import Box
 from jaxtyping import Array, Key
 
 from bayespbrl.policies.batch import sample_actions
-from bayespbrl.policies.policy import Policy, is_discrete
+from bayespbrl.policies.greedy import greedy
+from bayespbrl.policies.policy import Sampler
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Actor:
     """A stochastic policy and the action space whose bounds its actions keep.
 
     Attributes:
-      policy: stochastic policy.
+      policy: π(a|s).
       action_space: of the policy's actions.
       rng: where a call without a key draws from.
       observe: from an observation of the environment to one of the policy's.
@@ -27,7 +28,7 @@ class Actor:
       observation_shape: of one observation of the environment.
     """
 
-    policy: Policy
+    policy: Sampler
     action_space: Space[Any]
     rng: np.random.Generator
     observe: Callable[[Any], Any] = np.asarray
@@ -36,14 +37,7 @@ class Actor:
 
     def act(self, observation: Any, *, key: Key[Array, ""] | None = None) -> Any:
         """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete."""
-        if key is None:
-            key = jax.random.key(int(self.rng.integers(2**31)))
-        observation = self.observe(observation)
-        dtype = np.int64 if np.ndim(observation) == 0 else np.float64
-        action = sample_actions(self.policy, key, np.asarray(observation, dtype=dtype)[None])[0]
-        if isinstance(self.action_space, Box):
-            return self._within(action)
-        return int(self.enact(action))
+        return self._drawn(self.policy, observation, key)
 
     __call__ = act
 
@@ -66,14 +60,15 @@ class Actor:
         return np.stack([np.asarray(self._chosen(each, deterministic)) for each in observations]), state
 
     def _chosen(self, observation: Any, deterministic: bool) -> Any:
-        if not deterministic:
-            return self.act(observation)
-        rows = np.asarray(self.observe(observation))[None]
-        if is_discrete(self.policy):
-            return int(self.enact(int(np.argmax(self.policy.probabilities(rows)[0]))))  # type: ignore[attr-defined]
-        return self._within(self.policy.mean_actions(rows.astype(float))[0])  # type: ignore[attr-defined]
+        return self._drawn(greedy(self.policy) if deterministic else self.policy, observation)
 
-    def _within(self, action: np.ndarray) -> Any:
-        space = self.action_space
-        assert isinstance(space, Box)
-        return self.enact(np.clip(action, space.low, space.high).astype(space.dtype))
+    def _drawn(self, policy: Sampler, observation: Any, key: Key[Array, ""] | None = None) -> Any:
+        if key is None:
+            key = jax.random.key(int(self.rng.integers(2**31)))
+        observation = self.observe(observation)
+        dtype = np.int64 if np.ndim(observation) == 0 else np.float64
+        action = sample_actions(policy, key, np.asarray(observation, dtype=dtype)[None])[0]
+        if not isinstance(self.action_space, Box):
+            return int(self.enact(action))
+        clipped = np.clip(action, self.action_space.low, self.action_space.high)
+        return self.enact(clipped.astype(self.action_space.dtype))

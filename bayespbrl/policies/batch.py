@@ -9,14 +9,14 @@ from jax import Array
 from jaxtyping import Float, Key, Shaped
 from numpy.typing import ArrayLike
 
-from bayespbrl.policies.policy import AnyArray, Policy
+from bayespbrl.policies.policy import AnyArray, Policy, Sampler
 
 CHUNK = 1024
 
 
 @jax.jit
 def _sample_chunk(
-    policy: Policy, key: Key[Array, ""], start: Shaped[AnyArray, ""], observations: Shaped[AnyArray, "n ..."]
+    policy: Sampler, key: Key[Array, ""], start: Shaped[AnyArray, ""], observations: Shaped[AnyArray, "n ..."]
 ) -> Shaped[Array, "n ..."]:
     rows = start + jnp.arange(CHUNK, dtype=jnp.uint32)
     # one key a row, made from the row's number: the padding and the chunk size cannot change what a row draws
@@ -36,7 +36,7 @@ def _entropy_chunk(policy: Policy, observations: Shaped[AnyArray, "n ..."]) -> F
     return jax.vmap(policy.entropy)(observations)
 
 
-def sample_actions(policy: Policy, key: Key[Array, ""], observations: ArrayLike) -> Shaped[np.ndarray, "n ..."]:
+def sample_actions(policy: Sampler, key: Key[Array, ""], observations: ArrayLike) -> Shaped[np.ndarray, "n ..."]:
     """One action aᵢ ~ π(·|sᵢ) for each observation, float64 vectors, or int64 where actions are discrete.
 
     Row i depends on `key` and i alone, not on N. Continuous actions are not clipped.

@@ -121,6 +121,10 @@ class GaussianProcessPolicy:
         mean, variance = self.moments(observation)
         return mean + jnp.sqrt(variance) * jax.random.normal(key, mean.shape, mean.dtype)
 
+    def mode(self, observation: Float[AnyArray, " s"]) -> Float[Array, " a"]:
+        """The mean action."""
+        return self.moments(observation)[0]
+
     def log_prob(self, observation: Float[AnyArray, " s"], action: Float[AnyArray, " a"]) -> Float[Array, ""]:
         """log density of an (unclipped) action."""
         mean, variance = self.moments(observation)
@@ -143,10 +147,6 @@ class GaussianProcessPolicy:
         left = np.maximum(1.0 - np.stack(explained, axis=1), 0.0)
         variance = np.asarray(self.signal_variance) * left + np.asarray(self.noise_variance)
         return np.asarray(self.action_centre) + np.stack(means, axis=1), variance
-
-    def mean_actions(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
-        """Mean action at each of N observations, not clipped."""
-        return self.mean_and_variance(observations)[0]
 
     def action_standard_deviation(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
         """Standard deviation of the action at each of N observations, in the action's units."""

@@ -73,6 +73,10 @@ class LinearGaussianPolicy:
         mean = self.mean(observation)
         return mean + jnp.asarray(self.factor) @ jax.random.normal(key, mean.shape, mean.dtype)
 
+    def mode(self, observation: Float[AnyArray, " s"]) -> Float[Array, " a"]:
+        """The mean action."""
+        return self.mean(observation)
+
     def log_prob(self, observation: Float[AnyArray, " s"], action: Float[AnyArray, " a"]) -> Float[Array, ""]:
         """log density of an (unclipped) action."""
         factor = jnp.asarray(self.factor)

@@ -27,7 +27,8 @@ class Policy(Sampler, Protocol):
     the same type as an argument (`batch` maps them over N observations); the others take and return NumPy arrays.
     Policies over discrete actions also have `probabilities(observations) -> (N, A)`, those over continuous actions
     `action_standard_deviation(observations) -> (N, A)`. They may have `fit_mean`, called as `fit` is, which holds the
-    spread; it takes the place of `fit` in all but the first update of an iteration.
+    spread; it takes the place of `fit` in all but the first update of an iteration; and `mode(observation)`, the most
+    probable action, JAX-traceable: without it a run keeps the policy with its noise.
     """
 
     @classmethod

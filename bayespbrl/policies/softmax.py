@@ -108,6 +108,10 @@ class SoftmaxPolicy:
         """a ~ π(·|s)."""
         return jax.random.categorical(key, self.log_probabilities_at(observation))
 
+    def mode(self, observation: Float[AnyArray, " s"]) -> Int[Array, ""]:
+        """The most probable action."""
+        return jnp.argmax(self.log_probabilities_at(observation))
+
     def log_prob(self, observation: Float[AnyArray, " s"], action: Int[AnyArray, ""]) -> Float[Array, ""]:
         """log π(a|s)."""
         return self.log_probabilities_at(observation)[action]

@@ -47,6 +47,10 @@ class TabularPolicy:
         """a ~ π(·|s)."""
         return jax.random.categorical(key, jnp.log(jnp.asarray(self.table)[observation]))
 
+    def mode(self, observation: Int[AnyArray, ""]) -> Int[Array, ""]:
+        """The most probable action."""
+        return jnp.argmax(jnp.asarray(self.table)[observation])
+
     def log_prob(self, observation: Int[AnyArray, ""], action: Int[AnyArray, ""]) -> Float[Array, ""]:
         """log π(a|s); −∞ where the table holds a zero."""
         return jnp.log(jnp.asarray(self.table)[observation, action])

@@ -18,13 +18,15 @@ from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEst
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Final = "h5netcdf"
 MOST_BYTES_A_BYTE = 16  # arrays of a file in bytes, by its size
-PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "policy", "estimate")}
+PARTS = {"collected": ("trajectories", "tried"), "improved": ("trajectories", "tried", "policy", "estimate")}
 
 
 def write_iteration(file: Path, entry: Entry) -> None:
     """Write the heavy parts of one iteration to a netCDF file, whole or not at all."""
     parts = entry.parts
     groups = {"trajectories": xr.DataTree(_trajectories_dataset(parts["trajectories"]))}
+    if parts.get("tried"):
+        groups["tried"] = xr.DataTree(_trajectories_dataset(parts["tried"]))
     if "policy" in parts:
         groups["policy"] = to_tree(parts["policy"])
         groups |= _estimate_groups(parts["estimate"])
@@ -41,7 +43,7 @@ def read_iteration(
 def read_parts(
     file: Path, names: Sequence[str], *, features: StateFeatures | None = None, known: Sequence[type] = ()
 ) -> dict[str, Any]:
-    """Some of the parts of an iteration by name: `trajectories`, `policy`, `estimate`.
+    """Some of the parts of an iteration by name: `trajectories`, `tried`, `policy`, `estimate`.
 
     Args:
       file: as written by `write_iteration`.
@@ -54,6 +56,9 @@ def read_parts(
     """
     read = {
         "trajectories": lambda tree: _read_trajectories(tree.children["trajectories"].to_dataset()),
+        "tried": lambda tree: (
+            _read_trajectories(tree.children["tried"].to_dataset()) if "tried" in tree.children else ()
+        ),
         "policy": lambda tree: from_tree(tree.children["policy"], known=known),
         "estimate": lambda tree: _read_estimate(tree, features, known),
     }

@@ -144,15 +144,16 @@ class Run:
 
     @property
     def policy(self) -> Actor:
-        """The policy that the posterior thinks best of those tried; the newest where updates are not checked.
+        """The policy that the posterior thinks best of those tried, without its noise.
 
+        Where updates are not checked, as under the paper preset, the newest, with its noise.
         `run.policy.act(observation)` is an action; both are of the environment as it was given.
         """
         return self._actor(self.learner.policy)
 
     @property
     def last_policy(self) -> Actor:
-        """The newest policy."""
+        """The newest policy, with its noise."""
         return self._actor(self.learner.last_policy)
 
     def _actor(self, policy: Policy) -> Actor:
@@ -203,7 +204,7 @@ class Run:
         return write_answers(self.path / "preferences.csv" if file is None else file, self.learner.state.past)
 
     def evaluate(self, episodes: int = 100, seed: int = 0) -> float:
-        """Mean undiscounted return of `policy`, which is stochastic, over fresh episodes."""
+        """Mean undiscounted return of `policy` over fresh episodes."""
         learner = self.learner
         return float(
             rollouts.returns(
