@@ -17,7 +17,7 @@ from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement.check import EPISODES, Check, checked
+from bayespbrl.improvement.check import Check, checked
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
@@ -90,7 +90,7 @@ class Cycle:
             **({} if clips is None else {"clips": clips}),
             "seconds": time.perf_counter() - began,
         }
-        return _entry(event, trajectories=collected, tried=self._tried(state.policy))
+        return _entry(event, trajectories=collected)
 
     def _tried(self, policy: Any) -> tuple[Trajectory, ...]:
         """Trajectories without the policy's noise, from starts that are the same for all policies of the run."""
@@ -100,7 +100,7 @@ class Cycle:
             self.environment,
             greedy(policy),
             key=self._key(CHECK, 0),
-            episodes=EPISODES,
+            episodes=self.settings.update.check_episodes,
             max_steps=self.settings.rollouts.max_steps,
         )
 
@@ -168,16 +168,20 @@ class Cycle:
         clock.append(time.perf_counter())
         check = self._check(state, utility) if self.settings.update.checked else None
         improved, bound = self.update(state, utility, check)
+        tried = self._tried(improved.policy)
+        newest = state.iteration + 1
+        kept = newest if check is None else self._kept(state, utility, check, tried)
         clock.append(time.perf_counter())
         evaluated = self.evaluated(improved.policy)
         value = float(evaluated.total.mean())
         clock.append(time.perf_counter())
         seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
         summary = {
-            "iteration": state.iteration + 1,
+            "iteration": newest,
             "answers": state.preferences.answers,
-            "value": value if check is None else self._value_of(state, check.best),
+            "value": value if kept == newest else float(state.summaries[kept - 1]["value_newest"]),
             "value_newest": value,
+            "kept": kept,
             **({} if check is None else {"check": asdict(check)}),
             "terminated": float(evaluated.terminated.mean()),  # a share of the episodes
             **utility.quality.summary(),
@@ -187,9 +191,9 @@ class Cycle:
             "hyperparameters": utility.hyperparameters(),
         }
         return _entry(
-            {"event": "improved", "iteration": state.iteration + 1, "summary": summary},
+            {"event": "improved", "iteration": newest, "summary": summary},
             trajectories=state.trajectories[-options.trajectories_per_iteration :],
-            tried=state.tried,
+            tried=tried,
             policy=improved.policy,
             estimate=utility,
         )
@@ -208,20 +212,19 @@ class Cycle:
             max_steps=options.max_steps,
         )
 
-    def _value_of(self, state: LearnerState, number: int) -> float:
-        """The value of the policy after so many iterations."""
-        if number == 0:  # the first policy
-            value = state.summaries[0]["value"] if state.summaries else self.evaluated(state.policy).total.mean()
-        else:
-            value = state.summaries[number - 1]["value_newest"]
-        return float(value)
-
     def _check(self, state: LearnerState, utility: UtilityEstimate) -> Check:
-        """Whether the newest policy is better than the best before it, by the trajectories of both."""
-        if not state.best_tried:  # of the first iteration
+        """Whether the newest policy is better than the best before it, now that there are more answers."""
+        if not state.best_tried:  # nothing is known of the first policy
             return Check(state.iteration, state.trust)
         newest, best = map(utility.trajectory_utilities, (state.tried, state.best_tried))
         return checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
+
+    def _kept(self, state: LearnerState, utility: UtilityEstimate, check: Check, tried: tuple[Trajectory, ...]) -> int:
+        """The number of the policy that the run keeps: the best before the update, or the one after it."""
+        best = state.tried if check.best == state.iteration else state.best_tried
+        if best and np.mean(utility.trajectory_utilities(tried) - utility.trajectory_utilities(best)) <= 0:
+            return check.best
+        return state.iteration + 1
 
     def estimate(self, state: LearnerState) -> UtilityEstimate:
         """Step 1, the utility from all answers so far."""
@@ -271,7 +274,7 @@ class Cycle:
             None if constant else quarters(taken),
         )
         stepped_back = check is not None and check.stepped_back
-        policy = state.kept_policy if stepped_back else state.policy
+        policy = state.best_policy if stepped_back else state.policy
         proposed = propose(policy, problem, key=key, utility_draws=draws)
         usual, answers = settings.update.kl_bound, state.preferences.answers
         bound = schedules.decide(self.schedule, Situation(iteration + 1, answers, usual, utility, proposed))

@@ -35,7 +35,7 @@ class Entry:
 
     Attributes:
       event: plain data, one line of the log.
-      parts: `trajectories` and `tried` of `collected`; these, `policy` and `estimate` of `improved`.
+      parts: `trajectories` of `collected`; `trajectories`, `tried`, `policy` and `estimate` of `improved`.
     """
 
     event: Mapping[str, Any]
@@ -54,9 +54,10 @@ class LearnerState:
 
     Attributes:
       policy: the newest policy, which the next trajectories follow.
-      best_policy: the policy that the run keeps: of all that were tried the one that the posterior thinks best where
-        updates are checked, else the newest.
-      best: the number of the iteration that tried the best policy, from 0.
+      best_policy: where updates are checked, the one that the posterior thinks best of the policies before the newest;
+        the next update starts there after a step back.
+      best: the number of the best policy, that is of the iterations before it.
+      kept: the number of the policy that the run keeps: the best or, if the posterior prefers it, the newest.
       tried, best_tried: trajectories of the newest and of the best policy without their noise, where updates are
         checked; () where there are none.
       trust: share of the KL bound that the next update may use; it falls after a step back.
@@ -84,6 +85,7 @@ class LearnerState:
     policy: Any
     best_policy: Any = None
     best: int = 0
+    kept: int = 0
     tried: tuple[Trajectory, ...] = ()
     best_tried: tuple[Trajectory, ...] = ()
     trust: float = 1.0
@@ -123,8 +125,8 @@ class LearnerState:
 
     @property
     def kept_policy(self) -> Any:
-        """The best policy, or the first, before there is one."""
-        return self.policy if self.best_policy is None else self.best_policy
+        """The policy number `kept`."""
+        return self.policy if self.kept == self.iteration else self.best_policy
 
 
 def apply(state: LearnerState, entry: Entry) -> LearnerState:
@@ -142,22 +144,25 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
         case "answered":
             return _answered(state, event)
         case "improved":
-            check = _with_figures(event["summary"]).get("check")  # of a checked update
-            tried_is_best = check is not None and check["best"] == state.iteration
+            summary = _with_figures(event["summary"])
+            iteration, check = operator.index(event["iteration"]), summary.get("check")  # of a checked update
+            best = iteration if check is None else operator.index(check["best"])
+            kept = operator.index(summary.get("kept", best))
+            if kept not in (best, iteration):
+                raise ValueError(f"improved: expected policy {best} or {iteration} to be kept, got {kept}")
+            last_is_best = best == state.iteration
             return replace(
                 state,
                 policy=entry.parts["policy"],
-                best_policy=entry.parts["policy"]
-                if check is None
-                else state.policy
-                if tried_is_best
-                else state.best_policy,
-                best=state.iteration + 1 if check is None else operator.index(check["best"]),
-                best_tried=state.tried if tried_is_best else state.best_tried,
+                best_policy=state.policy if last_is_best else state.best_policy,
+                best=best,
+                kept=kept,
+                tried=tuple(entry.parts.get("tried", ())),
+                best_tried=state.tried if last_is_best else state.best_tried,
                 trust=1.0 if check is None else float(check["trust"]),
                 estimate=entry.parts["estimate"],
                 bound=Bound.recalled(event["summary"]["kl_bound"], event["summary"]["schedule"]),
-                iteration=operator.index(event["iteration"]),
+                iteration=iteration,
                 collected=False,
                 candidates=(),
                 wanted=0,
@@ -232,7 +237,6 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     return replace(
         state,
         trajectories=state.trajectories + tuple(parts["trajectories"]),
-        tried=tuple(parts.get("tried", ())),
         clips=state.clips + clips_in(event),
         preferences=preferences,
         collected=True,

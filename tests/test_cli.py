@@ -3,18 +3,21 @@
 import contextlib
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
 import sys
 from unittest import mock
 
+import jax
 import numpy as np
 import pytest
 import xarray as xr
 
 import bayespbrl
 from bayespbrl.cli.commands import main
+from bayespbrl.cli.compiled import VARIABLE, keep_compiled
 from bayespbrl.cli.display import show_trials
 from bayespbrl.experts import simulated_expert
 from bayespbrl.studies import Trials
@@ -238,3 +241,23 @@ def test_the_module_runs_as_a_program():
     )
     assert result.returncode == 2
     assert result.stderr.startswith("bayespbrl: environment: expected gridworld")
+
+
+def test_what_is_compiled_is_kept_in_the_users_cache_unless_jax_is_told_where(monkeypatch, tmp_path):
+    kept = jax.config.jax_compilation_cache_dir
+    try:
+        monkeypatch.setenv(VARIABLE, "elsewhere")
+        keep_compiled()
+        assert (os.environ[VARIABLE], jax.config.jax_compilation_cache_dir) == ("elsewhere", kept)
+        monkeypatch.delenv(VARIABLE)
+        (tmp_path / "file").write_text("")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))  # where no folder can be made
+        keep_compiled()
+        assert VARIABLE not in os.environ
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        keep_compiled()
+        (folder,) = (tmp_path / "bayespbrl").iterdir()
+        assert os.environ[VARIABLE] == jax.config.jax_compilation_cache_dir == str(folder)
+    finally:
+        os.environ.pop(VARIABLE, None)  # before monkeypatch restores it
+        jax.config.update("jax_compilation_cache_dir", kept)

@@ -55,6 +55,7 @@ BAD = {
     "plain_draws": [0, 15, 200.0, True],
     "repeats": [None, 1, -0.1, "all"],
     "checked": [None, 1, "yes"],
+    "check_episodes": [None, 1, 2.5, True],
     "critic_iterations": [0, -4, True, 2.0],
 }
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from bayespbrl import checks, runs
+from bayespbrl.cli.compiled import keep_compiled
 from bayespbrl.cli.display import (
     PICTURE,
     ask_on_page,
@@ -251,6 +252,7 @@ def results(
 
 def main() -> None:
     """Entry point. Bad input gives one line on standard error and exit status 2."""
+    keep_compiled()
     try:
         status = app(standalone_mode=False)
     except (ValueError, OSError) as error:

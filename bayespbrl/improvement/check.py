@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-EPISODES = 8  # of each policy
 LEAST_TRUST = 0.05
 STANDARD_ERRORS = 1.0  # by which the newest policy has to be worse for a step back
 
@@ -20,7 +19,7 @@ class Check:
     """The result for one iteration.
 
     Attributes:
-      best: number of the iteration that tried the best policy so far, from 0.
+      best: number of the best policy so far, that is of the iterations before it.
       trust: share of the KL bound that the next update may use.
       stepped_back: whether the run goes on from the best policy rather than from the newest.
       gain, standard_error: mean difference of the utilities of the trajectories, newest minus best, and its error.

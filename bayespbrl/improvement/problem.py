@@ -37,6 +37,7 @@ class PolicyUpdate:
       checked: whether each update is checked by trajectories of the policy without its noise: the run keeps the policy
         that the posterior thinks best, without noise, and goes on from there after a step back. The paper's learner
         never looks back.
+      check_episodes: number of these trajectories, of each policy.
       update_states: most of these states that the update takes, drawn at random, where they are continuous: it bounds
         time and memory for long episodes.
     """
@@ -48,6 +49,7 @@ class PolicyUpdate:
     critic_iterations: int | None = None
     update_states: int = 20_000
     checked: bool = False
+    check_episodes: int = 8
 
     def __post_init__(self) -> None:
         checks.positive("kl_bound", self.kl_bound)
@@ -59,6 +61,7 @@ class PolicyUpdate:
         checks.whole("update_states", self.update_states)
         if not isinstance(self.checked, bool):
             raise ValueError(f"checked: expected true or false, got {self.checked!r}")
+        checks.whole("check_episodes", self.check_episodes, 2)
 
 
 @dataclass(frozen=True, eq=False)

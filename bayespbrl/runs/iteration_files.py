@@ -18,7 +18,7 @@ from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEst
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Final = "h5netcdf"
 MOST_BYTES_A_BYTE = 16  # arrays of a file in bytes, by its size
-PARTS = {"collected": ("trajectories", "tried"), "improved": ("trajectories", "tried", "policy", "estimate")}
+PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "tried", "policy", "estimate")}
 
 
 def write_iteration(file: Path, entry: Entry) -> None:

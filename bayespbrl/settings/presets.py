@@ -133,7 +133,8 @@ class Task:
         Decision: Q looks a quarter of the horizon ahead; the noise of continuous actions is held for a fortieth of an
         episode (long for MountainCarContinuous; short for InvertedPendulum, which falls at once); in few dimensions
         functions are as fine as half the median rule, which learns Pendulum in half the iterations. Discrete actions
-        have features of their own each, so there are fewer centres and more trajectories (CartPole).
+        have features of their own each, so there are fewer centres and more trajectories (CartPole); whether such a
+        policy fails in an episode is a matter of luck, so more of them check it.
         """
         continuous = isinstance(self.action_space, Box)
         dimensions = self.observation_space.shape[0] if isinstance(self.observation_space, Box) else 0
@@ -141,6 +142,7 @@ class Task:
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
             "trajectories_per_iteration": 10 if continuous else 20,
+            "check_episodes": 8 if continuous else 24,
             "centres": 300 if continuous else 100,
             "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
         }

@@ -1,0 +1,37 @@
+"""Where the command line keeps what JAX has compiled, so that a process need not compile what an earlier one did."""
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+import jax
+
+VARIABLE = "JAX_COMPILATION_CACHE_DIR"  # JAX's own; it holds where it is set
+
+
+def keep_compiled() -> None:
+    """Keep compiled functions in the user's cache folder, for this process and those that it starts.
+
+    What is compiled for one processor may fail on another, and several may share a home: each kind has a folder.
+    """
+    if VARIABLE in os.environ:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "bayespbrl" / f"jax-{jax.__version__}-{_processor()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a home that cannot be written to
+        return
+    os.environ[VARIABLE] = str(folder)
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
+def _processor() -> str:
+    """A name for the kind of processor, with the instructions that it has where the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    known = sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
+    return hashlib.sha256("\n".join([platform.machine(), platform.processor(), *known]).encode()).hexdigest()[:16]
