@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from bayespbrl import events, queries, questions, rollouts
 from bayespbrl.events import Entry, LearnerState
@@ -166,11 +167,14 @@ class Cycle:
         clock = [time.perf_counter()]
         utility = self.estimate(state)
         clock.append(time.perf_counter())
-        check = self._check(state, utility) if self.settings.update.checked else None
+        check, of_best = self._check(state, utility) if self.settings.update.checked else (None, None)
         improved, bound = self.update(state, utility, check)
         tried = self._tried(improved.policy)
         newest = state.iteration + 1
-        kept = newest if check is None else self._kept(state, utility, check, tried)
+        if check is None or of_best is None or (utility.trajectory_utilities(tried) - of_best).mean() > 0:
+            kept = newest
+        else:
+            kept = check.best
         clock.append(time.perf_counter())
         evaluated = self.evaluated(improved.policy)
         value = float(evaluated.total.mean())
@@ -212,19 +216,19 @@ class Cycle:
             max_steps=options.max_steps,
         )
 
-    def _check(self, state: LearnerState, utility: UtilityEstimate) -> Check:
-        """Whether the newest policy is better than the best before it, now that there are more answers."""
-        if not state.best_tried:  # nothing is known of the first policy
-            return Check(state.iteration, state.trust)
-        newest, best = map(utility.trajectory_utilities, (state.tried, state.best_tried))
-        return checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
+    def _check(self, state: LearnerState, utility: UtilityEstimate) -> tuple[Check, Float[np.ndarray, " n"] | None]:
+        """Whether the newest policy is better than the best before it, now that there are more answers.
 
-    def _kept(self, state: LearnerState, utility: UtilityEstimate, check: Check, tried: tuple[Trajectory, ...]) -> int:
-        """The number of the policy that the run keeps: the best before the update, or the one after it."""
-        best = state.tried if check.best == state.iteration else state.best_tried
-        if best and np.mean(utility.trajectory_utilities(tried) - utility.trajectory_utilities(best)) <= 0:
-            return check.best
-        return state.iteration + 1
+        With it come the utilities of the better one's trajectories; None of the first policy, which is not tried.
+        """
+        if not state.tried:
+            return Check(state.iteration, state.trust), None
+        newest = utility.trajectory_utilities(state.tried)
+        if not state.best_tried:
+            return Check(state.iteration, state.trust), newest
+        best = utility.trajectory_utilities(state.best_tried)
+        check = checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
+        return check, newest if check.best == state.iteration else best
 
     def estimate(self, state: LearnerState) -> UtilityEstimate:
         """Step 1, the utility from all answers so far."""

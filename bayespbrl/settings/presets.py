@@ -142,7 +142,7 @@ class Task:
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
             "trajectories_per_iteration": 10 if continuous else 20,
-            "check_episodes": 8 if continuous else 24,
+            "check_episodes": 8 if continuous else 40,
             "centres": 300 if continuous else 100,
             "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
         }
