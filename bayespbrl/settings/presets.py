@@ -111,7 +111,12 @@ DEFAULT: dict[str, Any] = {
     "fixed_point_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
     "projection_ridge": 1e-5,
 }
-REPEATS = 0.1  # of the questions to people; a simulated expert would only repeat itself
+# Where people answer.
+PEOPLE: dict[str, Any] = {
+    "repeats": 0.1,  # a simulated expert would only repeat itself
+    "unasked_iterations": 0,  # a person waits for them
+    "evaluation_episodes": 20,  # and for these
+}
 
 
 @dataclass(frozen=True)
@@ -164,7 +169,7 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
         return {"hyperparameters": "given"} | PAPER.get(name, {})
     options = DEFAULT | ({} if task is None else task.derived()) | TASKS.get(name, {})
     if chosen.get("expert", "return") not in SIMULATED:
-        options["repeats"] = REPEATS
+        options |= PEOPLE
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":
         options["query"] = "highest-utility"
     return options
