@@ -17,6 +17,7 @@ from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEst
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Final = "h5netcdf"
+GROUPS = ("trajectories", "policy")  # parts that are a group each
 MOST_BYTES_A_BYTE = 16  # arrays of a file in bytes, by its size
 PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "tried", "policy", "estimate")}
 
@@ -62,10 +63,14 @@ def read_parts(
         "policy": lambda tree: from_tree(tree.children["policy"], known=known),
         "estimate": lambda tree: _read_estimate(tree, features, known),
     }
+    alone = (
+        names[0] if len(names) == 1 and names[0] in GROUPS else None
+    )  # the others are not looked at: that takes long
     try:
-        with xr.open_datatree(file, engine=ENGINE, decode_times=False) as opened:
+        with xr.open_datatree(file, engine=ENGINE, decode_times=False, group=alone) as opened:
             _check_size(file, opened)
             tree = opened.load()
+        tree = tree if alone is None else xr.DataTree(children={alone: tree})
         _check_numbers(tree)
         parts = {name: read[name](tree) for name in names}
     except (OSError, KeyError, RuntimeError, AttributeError, TypeError, ValueError, MemoryError, IndexError) as error:
