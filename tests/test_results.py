@@ -11,7 +11,7 @@ from test_cli import call, refused
 from test_trials import without_processes
 
 from bayespbrl.diagnostics.report.contents import read_contents
-from bayespbrl.results import read_study, values_table, write_results
+from bayespbrl.results import kept_table, read_study, values_table, write_results
 from bayespbrl.results.intervals import (
     answers_for_good,
     benjamini_hochberg,
@@ -107,6 +107,22 @@ def test_the_page_names_study_command_version_date_and_machine_and_counts_compar
     assert "| gridworld | first | the default | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
     assert {file.name for file in files} == {"values.csv", "runs.csv", "curves.png", "profiles.png"}
     assert sorted(path.name for path in made.iterdir()) == ["iterations.csv", "study.json", "study.toml"]
+
+
+def test_kept_policies_stand_beside_the_newest_and_the_best_of_their_runs(made):
+    assert kept_table(read_study(made)).empty  # the newest are kept
+    lines = pd.read_csv(made / "iterations.csv")
+    ended = (lines["methods"] == "first") & (lines["seed"] == 4)  # values 40, 94, 96, 20
+    lines.loc[ended, "value"] = [40, 94, 94, 94]
+    lines.to_csv(made / "iterations.csv", index=False)
+    (line,) = kept_table(read_study(made)).to_dict("records")
+    assert (line["methods"], line["trials"], line["worst"]) == ("first", "4", "94")
+    assert (line["kept"], line["newest"]) == ("97.5 [96.25]", "97.5 [77.75]")
+    assert line["best of the run"] == "97.5 [96.75]"
+    assert line["within 3 % of the best"] == "4 of 4"  # 94 of 96
+    lines.loc[ended, "value"] = [40, 40, 40, 93]
+    lines.to_csv(made / "iterations.csv", index=False)
+    assert kept_table(read_study(made)).loc[0, "within 3 % of the best"] == "3 of 4"
 
 
 def test_for_good_is_not_first_touch():

@@ -21,6 +21,7 @@ from bayespbrl.studies.declaration import AXES
 REACHED = 0.95  # of the relative value, (value − random policy) / (known reward − random policy)
 FAILED_BELOW = 0.5  # of the relative value, where the task declares no `failed_below`
 SURE = 0.95
+CLOSE = 0.03  # of what the best policy of a run gains over the random one
 MISSING = "–"
 
 
@@ -144,6 +145,33 @@ def runs_table(data: StudyData) -> pd.DataFrame:
         )
     table = pd.DataFrame(lines)
     return table.reindex(columns=_present(table)) if len(table) else table
+
+
+def kept_table(data: StudyData) -> pd.DataFrame:
+    """A line for each row whose kept policies are not just the newest: beside the newest, and the best of each run.
+
+    The best is by the hidden value, which only the evaluation knows.
+    """
+    lines = []
+    for row in data.rows:
+        trials = row.lines.groupby("seed")
+        kept, newest, best = trials["value"].last(), trials["value_newest"].last(), trials["value_newest"].max()
+        if row.declared.untrained or kept.equals(newest):
+            continue
+        floors = [other.final for other in data.of_task(row.declared.levels[0]) if other.declared.untrained]
+        close = best - kept <= CLOSE * (best - np.median(floors)) if floors else None
+        lines.append(
+            dict(zip(AXES, row.declared.levels, strict=True))
+            | {"trials": str(len(kept)), "kept": _median_and_quartile(kept), "worst": f"{kept.min():.4g}"}
+            | {"newest": _median_and_quartile(newest), "best of the run": _median_and_quartile(best)}
+            | {"within 3 % of the best": MISSING if close is None else f"{close.sum()} of {len(kept)}"}
+        )
+    table = pd.DataFrame(lines)
+    return table.reindex(columns=_present(table)) if len(table) else table
+
+
+def _median_and_quartile(values: pd.Series) -> str:
+    return f"{np.median(values):.4g} [{np.quantile(values, 0.25):.4g}]"
 
 
 def _of(value: float, form: str) -> str:
