@@ -176,7 +176,7 @@ class Cycle:
         else:
             kept = check.best
         clock.append(time.perf_counter())
-        evaluated = self.evaluated(improved.policy)
+        evaluated = self.evaluated(improved.policy if check is None else greedy(improved.policy))
         value = float(evaluated.total.mean())
         clock.append(time.perf_counter())
         seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
@@ -203,14 +203,11 @@ class Cycle:
         )
 
     def evaluated(self, policy: Any) -> rollouts.Returns:
-        """Fresh episodes, the same for all policies of the run; the learner never sees them.
-
-        Where updates are checked, and the policy is kept without its noise, it is evaluated without.
-        """
+        """Fresh episodes, the same for all policies of the run; the learner never sees them."""
         options = self.settings.rollouts
         return rollouts.returns(
             self.environment,
-            greedy(policy) if self.settings.update.checked else policy,
+            policy,
             key=self._key(EVALUATE, 0),
             episodes=options.evaluation_episodes,
             max_steps=options.max_steps,
@@ -219,14 +216,15 @@ class Cycle:
     def _check(self, state: LearnerState, utility: UtilityEstimate) -> tuple[Check, Float[np.ndarray, " n"] | None]:
         """Whether the newest policy is better than the best before it, now that there are more answers.
 
-        With it come the utilities of the better one's trajectories; None of the first policy, which is not tried.
+        With it come the utilities of the better one's trajectories; None of the first policy, which is not tried. What
+        an earlier version did not try is tried now.
         """
-        if not state.tried:
-            return Check(state.iteration, state.trust), None
-        newest = utility.trajectory_utilities(state.tried)
-        if not state.best_tried:
+        if state.iteration == 0:
+            return Check(0, state.trust), None
+        newest = utility.trajectory_utilities(state.tried or self._tried(state.policy))
+        if state.best == 0:
             return Check(state.iteration, state.trust), newest
-        best = utility.trajectory_utilities(state.best_tried)
+        best = utility.trajectory_utilities(state.best_tried or self._tried(state.best_policy))
         check = checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
         return check, newest if check.best == state.iteration else best
 

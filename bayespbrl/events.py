@@ -148,6 +148,8 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
             iteration, check = operator.index(event["iteration"]), summary.get("check")  # of a checked update
             best = iteration if check is None else operator.index(check["best"])
             kept = operator.index(summary.get("kept", best))
+            if check is not None and best not in (state.best, state.iteration):
+                raise ValueError(f"improved: expected {state.best} or {state.iteration} as the best, got {best}")
             if kept not in (best, iteration):
                 raise ValueError(f"improved: expected policy {best} or {iteration} to be kept, got {kept}")
             last_is_best = best == state.iteration

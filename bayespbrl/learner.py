@@ -34,7 +34,7 @@ class Learner:
     Args:
       env: a short name (`gridworld`, …), a gymnasium id, or an environment.
       features: φ of your own, from observations (N, S) to (N, D); None: drawn as the settings say.
-      policy: a kind of policy by name, or a first policy of your own.
+      policy: a kind of policy by name, or a first policy of your own, where the updates start; it is not kept itself.
       schedule: of the KL bound by name, or one of your own (`bayespbrl.improvement.schedules`).
       query: the rule for questions by name, or one of your own (`bayespbrl.queries`).
       entries: events of a run to continue.
@@ -108,7 +108,7 @@ class Learner:
     @property
     def policy(self) -> Any:
         """The policy that the posterior thinks best of those tried, without its noise; else the newest, with it."""
-        return greedy(self.state.kept_policy) if self.settings.update.checked else self.state.kept_policy
+        return greedy(self.state.kept_policy) if self.state.tried else self.state.kept_policy
 
     @property
     def last_policy(self) -> Any:

@@ -210,8 +210,11 @@ def test_repeated_questions_stay_within_the_budget_and_are_of_the_one_who_answer
     assert all(past[query.repeats].answerer == "Bob" for query in later)
 
 
-def test_people_are_asked_a_tenth_again_and_a_simulated_expert_nothing():
-    assert Learner("gridworld", expert="other").settings.questions.repeats == 0.1
+def test_people_are_asked_a_tenth_again_and_wait_for_no_silent_iteration():
+    people, simulated = (Learner("gridworld", expert=expert).settings for expert in ("other", "return"))
+    assert people.questions.repeats == 0.1
+    assert (people.questions.unasked_iterations, simulated.questions.unasked_iterations) == (0, 4)
+    assert (people.rollouts.evaluation_episodes, simulated.rollouts.evaluation_episodes) == (20, 100)
     assert Learner("gridworld", expert="terminal", repeats=0.0).settings.questions.repeats == 0
     assert Learner("gridworld").settings.questions.repeats == 0
     with pytest.raises(ValueError, match=r"repeats: expected a number in \[0, 1\), got 1"):

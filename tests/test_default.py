@@ -1,15 +1,19 @@
 """The default: a budget of answers, checked updates and the kept policy; questions from one start."""
 
+import json
+import shutil
 from itertools import pairwise
 
 import gymnasium
 import jax
 import numpy as np
 import pytest
+import xarray as xr
 from toys import Slope, fingerprint
 
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert, rollouts
+from bayespbrl.policies.actor import Actor
 from bayespbrl.rollouts import rollout
 
 FAST = {"max_steps": 8, "evaluation_episodes": 4, "centres": 20, "seed": 3, "hyperparameters": "given"}
@@ -71,6 +75,66 @@ def test_a_policy_is_tried_without_its_noise_from_starts_that_all_policies_share
     observation = np.array([0.1, -0.2])
     assert all(run.policy.act(observation) == run.policy.act(observation) for _ in range(3))
     assert run.last_policy.policy.action_standard_deviation(observation[None]) > 0
+
+
+class Plain:
+    """A policy of a user's with neither `mode` nor anything else of ours: a standard normal action."""
+
+    @classmethod
+    def initial(cls, observation_space, action_space):
+        return cls()
+
+    def sample(self, key, observation):
+        return jax.random.normal(key, (1,))
+
+    def log_prob(self, observation, action):
+        return -0.5 * (action**2).sum()
+
+    def entropy(self, observation):
+        return 1.4
+
+    def action_standard_deviation(self, observations):
+        return np.ones((len(observations), 1))
+
+    def kl_divergence(self, old, observations):
+        return np.zeros(len(observations))
+
+    def fit(self, observations, actions, sample_weights, *, rng, base_weights=None):
+        return self
+
+
+jax.tree_util.register_static(Plain)
+
+
+def test_a_policy_without_a_mode_is_tried_and_kept_with_its_noise():
+    learner = Learner(Slope(), policy=Plain(), answers=2, **FAST).run(ReturnExpert())
+    assert learner.iterations[-1]["kept"] > 0
+    assert isinstance(learner.policy, Plain)
+    actor = Actor(learner.policy, Slope.action_space, np.random.default_rng(0), observation_shape=(2,))
+    assert actor.act(np.zeros(2)) != actor.act(np.zeros(2))
+    with pytest.raises(ValueError, match="deterministic: expected a policy with a method mode, got Plain"):
+        actor.predict(np.zeros((1, 2)), deterministic=True)
+
+
+def test_a_run_of_an_earlier_version_which_tried_no_policy_goes_on(run, tmp_path):
+    """Its kept policy stays the same, with its noise, until it is continued."""
+    directory = shutil.copytree(run.path, tmp_path / "old")
+    for file in (directory / "iterations").iterdir():
+        with xr.open_datatree(file, engine="h5netcdf", decode_times=False) as tree:
+            old = tree.load()
+        old.drop_nodes("tried").to_netcdf(file, engine="h5netcdf")
+    lines = [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]
+    last = max(number for number, line in enumerate(lines) if line["event"] == "collected")
+    for line in lines:
+        line.get("summary", {}).pop("kept", None)
+    (directory / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines[:last]))
+    env = gymnasium.wrappers.TimeLimit(Slope(), 8)
+    learner = bayespbrl.resume(directory, env=env)
+    best = learner.state.best
+    assert learner.policy is learner.state.best_policy
+    learner.run(ReturnExpert())
+    assert learner.iterations[-1]["check"]["best"] in (best, learner.state.iteration - 1)
+    assert learner.policy is not learner.state.best_policy
 
 
 def test_a_step_back_goes_on_from_the_kept_policy_with_less_trust():

@@ -16,6 +16,7 @@ import pytest
 from test_cli import call, refused
 from test_trials import ThisProcess, without_processes
 
+import bayespbrl
 from bayespbrl import runs
 from bayespbrl.studies import Study, declared, rows
 from bayespbrl.studies.cluster import scheduler_executor
@@ -23,6 +24,7 @@ from bayespbrl.studies.declaration import parsed, shipped
 from bayespbrl.studies.engine import Engine, Progress
 from bayespbrl.studies.processes import trial_processes
 from bayespbrl.studies.rows import Seeds, row_of, run_trial
+from bayespbrl.studies.tables import measure_first_policy
 
 TINY = {"preset": "paper", "utility": "linear-program", "iterations": 2, "max_steps": 10, "evaluation_episodes": 2}
 DECLARATION = """
@@ -83,6 +85,13 @@ def test_an_untrained_cell_has_the_value_of_the_first_policy(finished):
     learner = runs.resume(finished / "gridworld/random/none/seed-2980")
     kept = json.loads((finished / "gridworld/random/none/seed-2980/first-policy.json").read_text())
     assert kept["value"] == pytest.approx(float(learner.cycle.evaluated(learner.policy).total.mean()))
+
+
+def test_the_random_policy_of_the_default_is_random(tmp_path):
+    learner = bayespbrl.Learner("gridworld", seed=1)
+    measure_first_policy(learner, tmp_path)
+    value = json.loads((tmp_path / "first-policy.json").read_text())["value"]
+    assert value == pytest.approx(42.6, abs=6)  # of the uniform policy, which has to have its noise; 18.75 without
 
 
 def test_a_second_call_computes_nothing_again_and_more_trials_may_follow(finished, tmp_path, monkeypatch):

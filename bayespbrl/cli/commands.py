@@ -68,7 +68,7 @@ RUN_OPTIONS = {
     "clip_steps": "Steps of the part of each trajectory, drawn at random, that questions are about; all if omitted.",
     "same_start": "Whether a question compares two trajectories from the same start, where resets by seed allow it.",
     "unasked_iterations": "Maximum number of consecutive iterations without a question (at most half the answers so "
-    "far); with the schedule confidence only while its confidence is high; the paper's is 0.",
+    "far); with the schedule confidence only while its confidence is high; the paper's is 0, and so is that of people.",
     "likelihood": "Likelihood of an answer: mixed (eq. 8), logistic or probit.",
     "prior_scale": "Prior standard deviation of each utility weight.",
     "steepness": "Steepness of the likelihood, for feature differences of root mean square length 1; inferred if "

@@ -3,11 +3,13 @@
 import hashlib
 import os
 import platform
+import warnings
 from pathlib import Path
 
 import jax
 
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"  # JAX's own; it holds where it is set
+TOO_SHORT = "Error reading persistent compilation cache entry"
 
 
 def keep_compiled() -> None:
@@ -17,12 +19,15 @@ def keep_compiled() -> None:
     """
     if VARIABLE in os.environ:
         return
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "bayespbrl" / f"jax-{jax.__version__}-{_processor()}"
     try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home) / "bayespbrl" / f"jax-{jax.__version__}-{_processor()}"
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # a home that cannot be written to
+    except (OSError, RuntimeError):  # no home, or one that cannot be written to
         return
+    # an entry that an interrupted process cut short is compiled again: no reason to warn
+    warnings.filterwarnings("ignore", message=TOO_SHORT)
+    os.environ.setdefault("PYTHONWARNINGS", f"ignore:{TOO_SHORT}")
     os.environ[VARIABLE] = str(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
 

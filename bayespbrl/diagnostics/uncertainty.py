@@ -91,7 +91,7 @@ def ranking_probabilities(returns: xr.Dataset) -> xr.Dataset:
 
 
 def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: int = 200, seed: int = 0) -> xr.Dataset:
-    """Posterior draws of Q(s, a) under the learner's policy, for each pair of the given states and actions.
+    """Posterior draws of Q(s, a) under the policy that the learner keeps, with its noise, for each state and action.
 
     LSTD-Q once, with the utility of each draw as a column, from all transitions of the learner. The state-action
     features are drawn as the learner draws them.

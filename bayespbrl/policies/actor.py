@@ -11,13 +11,13 @@ from gymnasium.spaces import Box
 from jaxtyping import Array, Key
 
 from bayespbrl.policies.batch import sample_actions
-from bayespbrl.policies.greedy import greedy
-from bayespbrl.policies.policy import Sampler
+from bayespbrl.policies.greedy import Greedy, greedy
+from bayespbrl.policies.policy import Sampler, is_discrete
 
 
 @dataclass(frozen=True)
 class Actor:
-    """A stochastic policy and the action space whose bounds its actions keep.
+    """A policy and the action space whose bounds its actions keep.
 
     Attributes:
       policy: π(a|s).
@@ -50,6 +50,9 @@ class Actor:
           observation: of the environment, or a batch with a leading axis.
           state, episode_start: of recurrent policies; passed through and not looked at.
           deterministic: the mean of continuous actions, or the most probable discrete one, instead of a sample.
+
+        Raises:
+          ValueError: observations of another shape; a policy of the user's that has neither `mode` nor `probabilities`.
         """
         observations = np.asarray(observation)
         if observations.shape == self.observation_shape:
@@ -60,7 +63,13 @@ class Actor:
         return np.stack([np.asarray(self._chosen(each, deterministic)) for each in observations]), state
 
     def _chosen(self, observation: Any, deterministic: bool) -> Any:
-        return self._drawn(greedy(self.policy) if deterministic else self.policy, observation)
+        policy = greedy(self.policy) if deterministic else self.policy
+        if not deterministic or isinstance(policy, Greedy):
+            return self._drawn(policy, observation)
+        if not is_discrete(policy):
+            raise ValueError(f"deterministic: expected a policy with a method mode, got {type(policy).__name__}")
+        rows = np.asarray(self.observe(observation))[None]
+        return int(self.enact(int(np.argmax(policy.probabilities(rows)[0]))))  # type: ignore[union-attr]
 
     def _drawn(self, policy: Sampler, observation: Any, key: Key[Array, ""] | None = None) -> Any:
         if key is None:

@@ -29,4 +29,4 @@ class Greedy:
 
 def greedy(policy: Any) -> Any:
     """`policy` without its noise; itself where it is one of the user's that has no `mode`."""
-    return Greedy(policy) if hasattr(type(policy), "mode") else policy
+    return Greedy(policy) if callable(getattr(type(policy), "mode", None)) else policy

@@ -98,7 +98,7 @@ class LinearGaussianPolicy:
     def kl_divergence(self, old: Self, observations: ArrayLike) -> Float[np.ndarray, " n"]:
         """KL(self ‖ old) of the two normal distributions at each of N observations."""
         new_factor, old_factor = np.asarray(self.factor), np.asarray(old.factor)
-        difference = np.linalg.solve(old_factor, (self.mean_actions(observations) - old.mean_actions(observations)).T)
+        difference = np.linalg.solve(old_factor, (self._means(observations) - old._means(observations)).T)
         ratio = np.linalg.solve(old_factor, new_factor)  # lower triangular: its squares sum to the trace term
         logarithms = np.log(np.diag(ratio)).sum()
         constant = 0.5 * (np.square(ratio).sum() - len(ratio)) - logarithms
@@ -151,7 +151,7 @@ class LinearGaussianPolicy:
         """`fit` with the noise held."""
         return replace(self.fit(*samples, rng=rng, base_weights=base_weights), factor=self.factor)
 
-    def mean_actions(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
+    def _means(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
         """Mean action at each of N observations, not clipped."""
         observations = np.asarray(observations, dtype=np.float64)
         coefficients = np.asarray(self.coefficients)

@@ -28,13 +28,16 @@ def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tu
     """
     film, strip = directory / f"{name}.gif", directory / f"{name}.png"
     environment, settings = learner.environment, learner.settings
+    # another number than the learner's would need a new compilation
+    update, number = settings.update, settings.rollouts.trajectories_per_iteration
+    episodes = update.check_episodes if update.checked else number
     try:
         if environment_attribute(environment, "draw") is not None:
             shown = rollouts.rollout(
                 environment,
                 learner.policy,
                 key=jax.random.key(settings.seed),
-                episodes=settings.rollouts.trajectories_per_iteration,  # another number would need a new compilation
+                episodes=episodes,
                 max_steps=settings.rollouts.max_steps,
             )[0]
             pictures.film(environment, shown, film, max_frames=FRAMES)

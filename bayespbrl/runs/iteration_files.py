@@ -1,4 +1,4 @@
-"""The netCDF file of one iteration: its trajectories, the policy, the utility estimate and its posterior."""
+"""The netCDF file of one iteration: its trajectories, the policy and what was tried of it, the utility estimate."""
 
 from collections.abc import Sequence
 from pathlib import Path

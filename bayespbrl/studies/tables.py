@@ -117,7 +117,7 @@ def has_first_policy(directory: Path | str) -> bool:
 
 def measure_first_policy(learner: Learner, directory: Path) -> None:
     """Measure the value of a learner's first policy, which is random, as an iteration's; in `first-policy.json`."""
-    returned = learner.cycle.evaluated(learner.first_policy())
+    returned = learner.cycle.evaluated(learner.first_policy())  # with its noise: without, it is not random
     content = {"episodes": len(returned.total), "value": float(returned.total.mean())}
     write_file(directory / FIRST_POLICY_FILE, json.dumps(content, indent=1) + "\n")
 
