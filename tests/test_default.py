@@ -77,6 +77,17 @@ def test_a_policy_is_tried_without_its_noise_from_starts_that_all_policies_share
     assert run.last_policy.policy.action_standard_deviation(observation[None]) > 0
 
 
+def test_undo_takes_back_which_policies_were_tried_and_kept():
+    straight, undone = (Learner(Slope(), answers=3, **FAST) for _ in range(2))
+    straight.run(ReturnExpert())
+    while questions := undone.ask():
+        undone.tell(["tie"])
+        undone.undo()  # after an iteration, from the second answer on
+        undone.tell([ReturnExpert()(*query.trajectories) for query in questions])
+    assert fingerprint(undone) == fingerprint(straight)
+    assert (undone.state.kept, undone.state.best) == (straight.state.kept, straight.state.best)
+
+
 class Plain:
     """A policy of a user's with neither `mode` nor anything else of ours: a standard normal action."""
 

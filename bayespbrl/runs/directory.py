@@ -2,7 +2,7 @@
 
 settings.json         the options of the run; the directory is created together with this file, in one step
 events.jsonl          every question and every answer, flushed to the disk before the learner moves on
-iterations/0001.nc    the iteration's trajectories, policy with those that tried it, utility estimate and posterior
+iterations/0001.nc    the iteration's trajectories, policy and its trials, utility estimate and posterior
 summary.json          the figures of each completed iteration
 """
 
