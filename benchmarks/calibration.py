@@ -22,6 +22,7 @@ import numpy as np
 from bayespbrl.diagnostics import gain_calibration, score_predictions
 from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.preferences import Answer
+from bayespbrl.runs.directory import read_summary
 
 SURE = 0.95
 
@@ -62,7 +63,7 @@ def row(study: Path) -> list[str]:
 
 def print_gains(studies: list[str], statistic: str) -> None:
     """How often an update was a gain, by a statistic of the schedule."""
-    runs = [read_contents(run).iterations for study in studies for run in run_directories(Path(study))]
+    runs = [read_summary(run)["iterations"] for study in studies for run in run_directories(Path(study))]
     result = gain_calibration(runs, statistic)
     print(f"\n| {statistic} | updates | stated | gained ± standard error |\n|---|---|---|---|")
     for n in np.flatnonzero(result["updates"].values > 0):
