@@ -115,7 +115,8 @@ def test_kept_policies_stand_beside_the_newest_and_the_best_of_their_runs(made):
     ended = (lines["methods"] == "first") & (lines["seed"] == 4)  # values 40, 94, 96, 20
     lines.loc[ended, "value"] = [40, 94, 94, 94]
     lines.to_csv(made / "iterations.csv", index=False)
-    (line,) = kept_table(read_study(made)).to_dict("records")
+    line, *others = kept_table(read_study(made)).to_dict("records")
+    assert [other["methods"] for other in others] == ["second", "known"]
     assert (line["methods"], line["trials"], line["worst"]) == ("first", "4", "94")
     assert (line["kept"], line["newest"]) == ("97.5 [96.25]", "97.5 [77.75]")
     assert line["best of the run"] == "97.5 [96.75]"

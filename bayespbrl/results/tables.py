@@ -148,16 +148,17 @@ def runs_table(data: StudyData) -> pd.DataFrame:
 
 
 def kept_table(data: StudyData) -> pd.DataFrame:
-    """A line for each row whose kept policies are not just the newest: beside the newest, and the best of each run.
+    """A line for each row: its kept policies beside the newest and the best of each run; none where all are the newest.
 
     The best is by the hidden value, which only the evaluation knows.
     """
-    lines = []
+    lines, others = [], 0
     for row in data.rows:
         trials = row.lines.groupby("seed")
         kept, newest, best = trials["value"].last(), trials["value_newest"].last(), trials["value_newest"].max()
-        if row.declared.untrained or kept.equals(newest):
+        if row.declared.untrained:
             continue
+        others += int((kept != newest).sum())
         floors = [other.final for other in data.of_task(row.declared.levels[0]) if other.declared.untrained]
         close = best - kept <= CLOSE * (best - np.median(floors)) if floors else None
         lines.append(
@@ -166,7 +167,7 @@ def kept_table(data: StudyData) -> pd.DataFrame:
             | {"newest": _median_and_quartile(newest), "best of the run": _median_and_quartile(best)}
             | {"within 3 % of the best": MISSING if close is None else f"{close.sum()} of {len(kept)}"}
         )
-    table = pd.DataFrame(lines)
+    table = pd.DataFrame(lines if others else [])
     return table.reindex(columns=_present(table)) if len(table) else table
 
 
