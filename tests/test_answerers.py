@@ -214,6 +214,7 @@ def test_people_are_asked_a_tenth_again_and_wait_for_no_silent_iteration():
     people, simulated = (Learner("gridworld", expert=expert).settings for expert in ("other", "return"))
     assert people.questions.repeats == 0.1
     assert (people.questions.unasked_iterations, simulated.questions.unasked_iterations) == (0, 4)
+    assert (people.questions.worthwhile, simulated.questions.worthwhile) == (False, True)
     assert (people.rollouts.evaluation_episodes, simulated.rollouts.evaluation_episodes) == (20, 100)
     assert Learner("gridworld", expert="terminal", repeats=0.0).settings.questions.repeats == 0
     assert Learner("gridworld").settings.questions.repeats == 0
