@@ -704,9 +704,12 @@ def test_exploration_is_held_for_as_many_steps_as_the_settings_say(monkeypatch):
 
 def test_exploration_is_held_for_a_share_of_the_first_episodes_where_they_end_early(monkeypatch):
     held, rollout = [], rollouts.rollout
-    monkeypatch.setattr(
-        rollouts, "rollout", lambda *a, **options: held.append(options["hold"]) or rollout(*a, **options)
-    )
+
+    def watched(*arguments, **options):
+        held.extend([options["hold"]] if "hold" in options else [])  # without, a policy is tried without its noise
+        return rollout(*arguments, **options)
+
+    monkeypatch.setattr(rollouts, "rollout", watched)
 
     class Falls(gymnasium.Env):
         """Ends by itself after 80 of at most 400 steps."""

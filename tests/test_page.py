@@ -345,8 +345,17 @@ def test_a_port_in_use_is_refused(gridworld):
         Page(Session(bayespbrl.Learner("gridworld", **QUICK)), port=gridworld.port)
 
 
+class WearsOut(Slope):
+    """Fails at every step from the 250th of its life on, whichever answer it is stepped for."""
+
+    def step(self, action):
+        if self.life >= 250:
+            raise RuntimeError("the motor is on fire")
+        return super().step(action)
+
+
 def test_an_environment_that_fails_while_a_person_answers_says_so(browser):
-    learner = bayespbrl.Learner(Slope("raises", at=250), expert="other", **QUICK)
+    learner = bayespbrl.Learner(WearsOut(), expert="other", **QUICK)
     with served(learner) as page, tab(browser, page) as opened:
         while opened.get_attribute(".bp-box", "data-phase") == "question":
             opened.keyboard.press("ArrowLeft")

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"  # JAX's own; it holds where it is set
-TOO_SHORT = "Error reading persistent compilation cache entry"
+HARMLESS = tuple(f"Error {doing} persistent compilation cache entry" for doing in ("reading", "writing"))
 
 
 def keep_compiled() -> None:
@@ -17,6 +17,9 @@ def keep_compiled() -> None:
 
     What is compiled for one processor may fail on another, and several may share a home: each kind has a folder.
     """
+    # an entry that was cut short is compiled again, and one that the disk has no room for the next time
+    warnings.filterwarnings("ignore", message=f"({'|'.join(HARMLESS)})")
+    os.environ.setdefault("PYTHONWARNINGS", ",".join(f"ignore:{message}" for message in HARMLESS))
     if VARIABLE in os.environ:
         return
     try:
@@ -25,9 +28,6 @@ def keep_compiled() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # no home, or one that cannot be written to
         return
-    # an entry that an interrupted process cut short is compiled again: no reason to warn
-    warnings.filterwarnings("ignore", message=TOO_SHORT)
-    os.environ.setdefault("PYTHONWARNINGS", f"ignore:{TOO_SHORT}")
     os.environ[VARIABLE] = str(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
 
