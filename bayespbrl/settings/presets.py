@@ -116,7 +116,7 @@ PEOPLE: dict[str, Any] = {
     "repeats": 0.1,  # a simulated expert would only repeat itself
     "unasked_iterations": 0,  # a person waits for them
     "evaluation_episodes": 20,  # and for these
-    "worthwhile": False,  # the page says what an answer is worth; silent iterations until one is worth more take long
+    "worthwhile": False,  # the page says what an answer is worth, and leaves it to the person to stop
 }
 
 
