@@ -78,17 +78,20 @@ class StudyData:
         """The rows of a task."""
         return [row for row in self.rows if row.declared.levels[0] == task]
 
+    def floor(self, task: str) -> float | None:
+        """Median value of the random policy; None where the study has no such row."""
+        floors = [row.final for row in self.of_task(task) if row.declared.untrained]
+        return float(np.median(np.concatenate(floors))) if floors else None
+
     def floor_and_ceiling(self, task: str) -> tuple[float, float] | None:
         """Median value of the random policy and, at its end, of the reference run on the hidden reward.
 
         None where the study has no such rows, or the two are not in this order.
         """
-        rows = self.of_task(task)
-        floors = [row.final for row in rows if row.declared.untrained]
+        rows, floor = self.of_task(task), self.floor(task)
         ceilings = [row.final for row in rows if row.declared.options.get("utility") == "known-reward"]
-        if not floors or not ceilings:
+        if floor is None or not ceilings:
             return None
-        floor = float(np.median(np.concatenate(floors)))
         ceiling = max(float(np.median(values)) for values in ceilings)
         return (floor, ceiling) if ceiling > floor else None
 

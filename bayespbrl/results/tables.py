@@ -64,7 +64,7 @@ def _of_trials(row: RowData, scale: tuple[float, float] | None, report_at: tuple
         "trials": str(len(row.final)),
         "answers": f"{np.median(row.used):g}",
         **{
-            f"after {number}": MISSING if value is None else f"{np.median(value):.4g} [{np.quantile(value, 0.25):.4g}]"
+            f"after {number}": MISSING if value is None else _median_and_quartile(value)
             for number, value in zip(report_at, values, strict=True)
         },
         "median": f"{np.median(row.final):.4g}",
@@ -154,13 +154,13 @@ def kept_table(data: StudyData) -> pd.DataFrame:
     """
     lines, others = [], 0
     for row in data.rows:
-        trials = row.lines.groupby("seed")
-        kept, newest, best = trials["value"].last(), trials["value_newest"].last(), trials["value_newest"].max()
         if row.declared.untrained:
             continue
+        trials = row.lines.groupby("seed")["value_newest"]
+        kept, newest, best = row.final, trials.last().to_numpy(), trials.max().to_numpy()
         others += int((kept != newest).sum())
-        floors = [other.final for other in data.of_task(row.declared.levels[0]) if other.declared.untrained]
-        close = best - kept <= CLOSE * (best - np.median(floors)) if floors else None
+        floor = data.floor(row.declared.levels[0])
+        close = None if floor is None else best - kept <= CLOSE * (best - floor)
         lines.append(
             dict(zip(AXES, row.declared.levels, strict=True))
             | {"trials": str(len(kept)), "kept": _median_and_quartile(kept), "worst": f"{kept.min():.4g}"}
@@ -171,7 +171,7 @@ def kept_table(data: StudyData) -> pd.DataFrame:
     return table.reindex(columns=_present(table)) if len(table) else table
 
 
-def _median_and_quartile(values: pd.Series) -> str:
+def _median_and_quartile(values: np.ndarray) -> str:
     return f"{np.median(values):.4g} [{np.quantile(values, 0.25):.4g}]"
 
 

@@ -17,7 +17,6 @@ from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEst
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 ENGINE: Final = "h5netcdf"
-GROUPS = ("trajectories", "policy")  # parts that are a group each
 MOST_BYTES_A_BYTE = 16  # arrays of a file in bytes, by its size
 PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "tried", "policy", "estimate")}
 
@@ -63,9 +62,8 @@ def read_parts(
         "policy": lambda tree: from_tree(tree.children["policy"], known=known),
         "estimate": lambda tree: _read_estimate(tree, features, known),
     }
-    alone = (
-        names[0] if len(names) == 1 and names[0] in GROUPS else None
-    )  # the others are not looked at: that takes long
+    # to look at the other groups takes ten times as long
+    alone = "trajectories" if tuple(names) == ("trajectories",) else None
     try:
         with xr.open_datatree(file, engine=ENGINE, decode_times=False, group=alone) as opened:
             _check_size(file, opened)
