@@ -2,9 +2,11 @@
 
 import os
 
+import numpy as np
 import pytest
+import xarray as xr
 
-from bayespbrl.runs.files import write_file, written_aside
+from bayespbrl.runs.files import write_file, write_netcdf, written_aside
 
 
 @pytest.mark.parametrize(("content", "expected"), [("σ = 1\n", "σ = 1\n".encode()), (b"\x89PNG\r\n", b"\x89PNG\r\n")])
@@ -44,3 +46,12 @@ def test_the_content_is_on_the_disk_before_it_takes_the_files_place(tmp_path, mo
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append((os.fstat(descriptor).st_size, file.exists())))
     write_file(file, "content")
     assert synced == [(7, False)]
+
+
+def test_a_netcdf_file_has_all_groups_and_no_room_to_spare(tmp_path):
+    numbers = xr.Dataset({"a": ("x", np.arange(5.0)), "b": ((), True)}, attrs={"class": "numbers"})
+    tree = xr.DataTree.from_dict({"/": numbers, "/inner/text": xr.Dataset({"c": ("y", ["one", "three"])})})
+    write_netcdf(tmp_path / "tree.nc", tree)
+    with xr.open_datatree(tmp_path / "tree.nc", engine="h5netcdf") as opened:  # another library than the one that wrote
+        assert opened.load().identical(tree)
+    assert (tmp_path / "tree.nc").stat().st_size < 16_000

@@ -1,16 +1,16 @@
 """Files that are on the disk whole or not at all: written aside, flushed, renamed into place."""
 
-import io
 import os
-import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 
+import netCDF4
 import xarray as xr
+from xarray.backends import NetCDF4DataStore
 
-_ONE_AT_A_TIME = threading.Lock()  # the setting of Dask below is the whole process's
+NETCDF = threading.Lock()  # to hold while a netCDF file is read or written: the library serves one thread at a time
 
 
 @contextmanager
@@ -36,17 +36,22 @@ def written_aside(file: Path) -> Iterator[Path]:
 def write_netcdf(file: Path, data: xr.Dataset | xr.DataTree) -> None:
     """Write a netCDF file, whole or not at all.
 
-    HDF5 ends the process where the disk is full while it writes to it; the bytes are therefore made in memory. In a
-    Dask worker xarray would lock them by a lock of the cluster, which needs a file name and fails without one.
+    HDF5 ends the process where the disk is full while it writes to it; the bytes are therefore made in memory.
     """
-    content = io.BytesIO()
-    dask = sys.modules.get("dask")  # imported wherever this may be a Dask worker
-    with _ONE_AT_A_TIME, nullcontext() if dask is None else dask.config.set(scheduler="threads"):
-        data.to_netcdf(content, engine="h5netcdf")
-    write_file(file, content.getvalue())
+    tree = data if isinstance(data, xr.DataTree) else xr.DataTree(data)
+    with NETCDF:
+        opened = netCDF4.Dataset(file.name, "w", memory=0)
+        try:
+            for node in tree.subtree:
+                group = opened if node is tree else opened.createGroup(node.path)
+                node.to_dataset(inherit=False).dump_to_store(NetCDF4DataStore(group))
+        finally:
+            content = opened.close()
+    # the buffer has room to spare; the superblock says where the file ends (HDF5 file format, versions 2 and 3)
+    write_file(file, content[: int.from_bytes(content[28:36], "little")])
 
 
-def write_file(file: Path, content: str | bytes) -> None:
+def write_file(file: Path, content: str | bytes | memoryview) -> None:
     """Write text, as UTF-8, or bytes to `file`, whole or not at all."""
     with written_aside(file) as aside:
         aside.write_bytes(content.encode() if isinstance(content, str) else content)

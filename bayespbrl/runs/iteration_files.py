@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,13 +10,12 @@ import xarray as xr
 from bayespbrl.events import Entry
 from bayespbrl.features import StateFeatures
 from bayespbrl.models import restored, stored
-from bayespbrl.runs.files import write_netcdf
+from bayespbrl.runs.files import NETCDF, write_netcdf
 from bayespbrl.runs.stored_classes import from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEstimate
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
-ENGINE: Final = "h5netcdf"
 MOST_BYTES_A_BYTE = 16  # arrays of a file in bytes, by its size
 PARTS = {"collected": ("trajectories",), "improved": ("trajectories", "tried", "policy", "estimate")}
 
@@ -65,7 +64,7 @@ def read_parts(
     # to look at the other groups takes ten times as long
     alone = "trajectories" if tuple(names) == ("trajectories",) else None
     try:
-        with xr.open_datatree(file, engine=ENGINE, decode_times=False, group=alone) as opened:
+        with NETCDF, xr.open_datatree(file, engine="netcdf4", decode_times=False, group=alone) as opened:
             _check_size(file, opened)
             tree = opened.load()
         tree = tree if alone is None else xr.DataTree(children={alone: tree})
