@@ -6,8 +6,8 @@
 Each argument is a run directory or a folder of them, and becomes one row. An answer is predicted by the posterior that
 the learner had when it asked; the first iteration, in which it had none, is left out. `z` is the log score less its
 expectation under the predictions themselves, in standard deviations: below −2 the predictions are overconfident. `ECE`
-is the expected calibration error over bins of width 0.1 of the confidence. The last column is the share of right
-predictions among those stated with at least 0.95.
+is the expected calibration error over bins of width 0.1 of the confidence, beside that of calibrated predictions by
+chance. The last column is the share of right predictions among those stated with at least 0.95.
 
 Two more tables follow, of the updates of all studies: how often an update was a gain of the hidden value, by the share
 of the posterior draws that called it one (agreement), and by the schedule's signal. Runs with a constant bound have
@@ -18,13 +18,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from bayespbrl.diagnostics import gain_calibration, score_predictions
+from bayespbrl.diagnostics import gain_calibration
 from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.preferences import Answer
+from bayespbrl.results.tables import calibration_line, markdown
 from bayespbrl.runs.directory import read_summary
-
-SURE = 0.95
 
 
 def run_directories(study: Path) -> list[Path]:
@@ -46,19 +46,10 @@ def predictions(study: Path) -> tuple[np.ndarray, np.ndarray, int]:
     return predicted, np.array([answer.answer is Answer.FIRST for answer in decided], dtype=bool), len(runs)
 
 
-def row(study: Path) -> list[str]:
+def row(study: Path) -> dict[str, str]:
     """One line of the table."""
     predicted, observed, runs = predictions(study)
-    scores = score_predictions(np.clip(predicted, 0, 1), observed)
-    confidence = np.maximum(predicted, 1 - predicted)
-    right = np.where(predicted >= 0.5, observed, ~observed)[confidence >= SURE]
-    score, expected, deviation, z, error = (
-        float(scores[name])
-        for name in ("log_score", "log_score_expected", "log_score_sd", "log_score_z", "expected_calibration_error")
-    )
-    sure = f"{right.mean():.2f} (n = {len(right)})" if len(right) else "–"
-    of_scores = [f"{score:.1f}", f"{expected:.1f} ± {deviation:.1f}", f"{z:.1f}", f"{error:.3f}"]
-    return [study.name, str(runs), str(len(predicted)), *of_scores, sure]
+    return {"study": study.name, "runs": str(runs)} | calibration_line(np.clip(predicted, 0, 1), observed)
 
 
 def print_gains(studies: list[str], statistic: str) -> None:
@@ -74,10 +65,7 @@ def print_gains(studies: list[str], statistic: str) -> None:
 
 def main(studies: list[str]) -> None:
     """Print the tables as markdown."""
-    columns = ["study", "runs", "answers", "log score", "expected ± sd", "z", "ECE", f"right of those ≥ {SURE}"]
-    print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
-    for study in studies:
-        print(f"| {' | '.join(row(Path(study)))} |", flush=True)
+    print(markdown(pd.DataFrame([row(Path(study)) for study in studies])), flush=True)
     for statistic in ("agreement", "signal"):
         print_gains(studies, statistic)
 

@@ -53,6 +53,9 @@ def test_scores_of_two_predictions_by_hand():
     assert float(result["brier_score_expected"]) == pytest.approx((0.16 + 0.21) / 2)
     # said 0.8 and was right, said 0.7 for the other side and was wrong: two bins of one prediction each
     assert float(result["expected_calibration_error"]) == pytest.approx((0.2 + 0.7) / 2)
+    # by chance: misses of 0.2 or 0.8, and of 0.3 or 0.7
+    by_chance = [float(result[f"expected_calibration_error_{end}"]) for end in ("expected", "sd")]
+    assert by_chance == pytest.approx([(0.32 + 0.42) / 2, np.sqrt(0.6**2 * 0.16 + 0.4**2 * 0.21) / 2], abs=0.02)
     sd = np.sqrt(0.8 * 0.2 * np.log(4) ** 2 + 0.3 * 0.7 * np.log(7 / 3) ** 2)
     assert float(result["log_score_z"]) == pytest.approx(float(result["log_score"] - result["log_score_expected"]) / sd)
     np.testing.assert_allclose(result["frequency"], [1, 1])

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ from test_cli import call, refused
 from test_trials import without_processes
 
 from bayespbrl.diagnostics.report.contents import read_contents
-from bayespbrl.results import kept_table, read_study, values_table, write_results
+from bayespbrl.results import calibration_table, kept_table, read_study, values_table, write_results
 from bayespbrl.results.intervals import (
     answers_for_good,
     benjamini_hochberg,
@@ -24,6 +25,7 @@ from bayespbrl.results.intervals import (
 from bayespbrl.studies import Study
 from bayespbrl.studies.declaration import parsed
 
+STUDIES = Path(__file__).parents[1] / "benchmarks" / "studies"
 DECLARATION = """
 title = "Hand-made"
 trials = 4
@@ -124,6 +126,18 @@ def test_kept_policies_stand_beside_the_newest_and_the_best_of_their_runs(made):
     lines.loc[ended, "value"] = [40, 40, 40, 93]
     lines.to_csv(made / "iterations.csv", index=False)
     assert kept_table(read_study(made)).loc[0, "within 3 % of the best"] == "3 of 4"
+
+
+def test_predictions_are_pooled_over_tasks_and_not_over_methods():
+    *of_tasks, pooled = calibration_table(read_study(STUDIES / "tasks")).to_dict("records")
+    assert (pooled["tasks"], len(of_tasks)) == ("all", 5)
+    for count in ("runs", "answers predicted"):
+        assert int(pooled[count]) == sum(int(line[count]) for line in of_tasks)
+    errors = [float(line["ECE"]) for line in of_tasks]
+    by_chance = [float(line["if calibrated"].split(" ± ")[0]) for line in of_tasks]
+    assert float(pooled["if calibrated"].split(" ± ")[0]) < min(by_chance)  # of more answers
+    assert float(pooled["ECE"]) < max(errors)
+    assert "all" not in calibration_table(read_study(STUDIES / "sampler"))["methods"].to_list()
 
 
 def test_for_good_is_not_first_touch():

@@ -129,7 +129,7 @@ def score_predictions(
       `log_score_z`, the log score less its expectation in standard deviations: below −2 the predictions are
       overconfident; `miscalibration`, `discrimination`, `uncertainty`: brier_score = miscalibration − discrimination +
       uncertainty; `expected_calibration_error`: mean distance between confidence max(p, 1 − p) and the share of right
-      predictions, over bins of width 0.1.
+      predictions, over bins of width 0.1, with what calibrated predictions have by chance, `…_expected` and `…_sd`.
       Means over no predictions are NaN.
 
     Source: Dimitriadis, Gneiting & Jordan (2021), the curve of `arviz_plots.plot_ppc_pava`.
@@ -153,6 +153,7 @@ def score_predictions(
             "band_lower": ("forecast", band[0]),
             "band_upper": ("forecast", band[1]),
             **_scores(predicted, observed, frequency[place]),
+            **_calibration_error(predicted, np.vstack([observed, draws])),
         },
         coords={"forecast": forecasts},
         attrs={"level": level},
@@ -196,7 +197,7 @@ def _scores(predicted: np.ndarray, observed: np.ndarray, recalibrated: np.ndarra
     if number == 0:
         sums, brier = ("log_score", "log_score_expected", "log_score_sd"), ("", "_expected", "_sd")
         means = (*(f"brier_score{end}" for end in brier), "miscalibration", "discrimination", "uncertainty")
-        means += ("log_score_z", "expected_calibration_error")
+        means += ("log_score_z",)
         return dict.fromkeys(sums, 0.0) | dict.fromkeys(means, np.nan)
     variance = predicted * (1 - predicted)
     # a prediction of 0 or 1 has infinite log odds and adds no variance
@@ -208,14 +209,11 @@ def _scores(predicted: np.ndarray, observed: np.ndarray, recalibrated: np.ndarra
     score = np.sum(xlogy(observed, predicted) + xlog1py(~observed, -predicted))
     expected = np.sum(xlogy(predicted, predicted) + xlog1py(1 - predicted, -predicted))
     deviation = np.sqrt(np.sum(variance * log_odds**2))
-    confidence, right = np.maximum(predicted, 1 - predicted), np.where(predicted >= 0.5, observed, ~observed)
-    bins = np.minimum((confidence * 10).astype(int), 9)
     return {
         "log_score": score,
         "log_score_expected": expected,
         "log_score_sd": deviation,
         "log_score_z": (score - expected) / deviation if deviation > 0 else np.nan,
-        "expected_calibration_error": np.sum(np.abs(np.bincount(bins, right - confidence))) / number,
         "brier_score": brier,
         "brier_score_expected": np.mean(variance),
         "brier_score_sd": np.sqrt(np.sum(variance * (1 - 2 * predicted) ** 2)) / number,
@@ -223,3 +221,14 @@ def _scores(predicted: np.ndarray, observed: np.ndarray, recalibrated: np.ndarra
         "discrimination": uncertainty - after,
         "uncertainty": uncertainty,
     }
+
+
+def _calibration_error(predicted: np.ndarray, outcomes: np.ndarray) -> dict[str, float]:
+    """Expected calibration error: of the first row of the outcomes, and mean and deviation of those of all others."""
+    name = "expected_calibration_error"
+    if len(predicted) == 0:
+        return dict.fromkeys((name, f"{name}_expected", f"{name}_sd"), np.nan)
+    confidence, right = np.maximum(predicted, 1 - predicted), np.where(predicted >= 0.5, outcomes, ~outcomes)
+    one_hot = np.minimum((confidence * 10).astype(int), 9)[:, None] == np.arange(10)
+    errors = np.sum(np.abs((right - confidence) @ one_hot), axis=1) / len(predicted)
+    return {name: errors[0], f"{name}_expected": np.mean(errors[1:]), f"{name}_sd": np.std(errors[1:])}

@@ -193,24 +193,31 @@ def calibration_table(data: StudyData) -> pd.DataFrame:
         chosen = np.logical_and.reduce([data.predicted[a] == level for a, level in zip(AXES, levels, strict=True)])
         if chosen.any():
             lines.append(dict(zip(AXES, levels, strict=True)) | _scores(data.predicted[chosen]))
+    if len(lines) > 1 and len({tuple(line[axis] for axis in AXES[1:]) for line in lines}) == 1:  # tasks alone differ
+        lines.append(lines[0] | {"tasks": "all"} | _scores(data.predicted))
     table = pd.DataFrame(lines)
     return table.reindex(columns=_present(table)) if len(table) else table
 
 
 def _scores(answers: pd.DataFrame) -> dict[str, str]:
     predicted, observed = answers["predicted"].to_numpy(float), answers["first"].to_numpy(bool)
-    scores = score_predictions(np.clip(predicted, 0, 1), observed, simulations=1)
+    return {"runs": str(answers.groupby([*AXES, "seed"], dropna=False).ngroups)} | calibration_line(predicted, observed)
+
+
+def calibration_line(predicted: np.ndarray, observed: np.ndarray) -> dict[str, str]:
+    """How well n probabilities predicted n outcomes, shapes (n,), as the cells of a table."""
+    scores = score_predictions(np.clip(predicted, 0, 1), observed)
+    score, expected, deviation, z = (float(scores[f"log_score{end}"]) for end in ("", "_expected", "_sd", "_z"))
+    error, chance, by_chance = (float(scores[f"expected_calibration_error{end}"]) for end in ("", "_expected", "_sd"))
     confidence = np.maximum(predicted, 1 - predicted)
     right = np.where(predicted >= 0.5, observed, ~observed)[confidence >= SURE]
-    names = ("log_score", "log_score_expected", "log_score_sd", "log_score_z", "expected_calibration_error")
-    score, expected, deviation, z, error = (float(scores[name]) for name in names)
     return {
-        "runs": str(answers["seed"].nunique()),
-        "answers predicted": str(len(answers)),
+        "answers predicted": str(len(predicted)),
         "log score": f"{score:.1f}",
         "expected": f"{expected:.1f} ± {deviation:.1f}",
         "z": f"{z:.1f}",
         "ECE": f"{error:.3f}",
+        "if calibrated": f"{chance:.3f} ± {by_chance:.3f}",
         f"right of those ≥ {SURE}": f"{right.mean():.2f} (n = {len(right)})" if len(right) else MISSING,
     }
 

@@ -52,7 +52,7 @@ def section(data: StudyData, name: str, table: pd.DataFrame) -> str:
         "kept": "Value, median [lower quartile], of the policy that a run keeps, of its newest, and of the best of the "
         "run, which only the hidden reward knows. Within 3 % of the best: of what that gains over the random policy.",
         "calibration": "Each answer was predicted before it was given. `z` below −2: overconfident, above 2: "
-        "underconfident. ECE: expected calibration error.",
+        "underconfident. ECE: expected calibration error, and that of calibrated predictions, by chance.",
         "runs": "Fits: posteriors over all trials and iterations. ESS: effective sample size of the worst margin. "
         "Signal, KL: medians over updates.",
     }

@@ -109,13 +109,13 @@ def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
     if not total:
         return ["No answer could be predicted before it was given."], []
     rows = []
-    for name, label in (("log_score", "log score (nats, summed)"), ("brier_score", "Brier score (mean)")):
+    labels = ("log score (nats, summed)", "Brier score (mean)", "expected calibration error")
+    for name, label in zip(("log_score", "brier_score", "expected_calibration_error"), labels, strict=True):
         got, expected, sd = (number(float(scores[name + end])) for end in ("", "_expected", "_sd"))
         rows.append([label, got, f"{expected} ± {sd}"])
     rows.append(
         ["log score less its expectation, in standard deviations (z)", cell(float(scores["log_score_z"])), "0 ± 1"]
     )
-    rows.append(["expected calibration error", cell(float(scores["expected_calibration_error"])), ""])
     rows += [[name, number(float(scores[name])), ""] for name in ("miscalibration", "discrimination", "uncertainty")]
     caption = "Each answer was predicted by the posterior that the learner had when it asked. 0 is the best score."
     table = Table(caption, ["", "score", "expected if calibrated"], rows)
