@@ -1,24 +1,27 @@
 """Three ways from answers to a policy, on the same tasks and with the same number of answers.
 
     make neighbours [OPTIONS="--tasks Pendulum-v1 --answers 16"]
-    python benchmarks/neighbours.py run [--tasks ...] [--answers ...] [--seeds ...] [--steps 100000] [--out FILE.csv]
+    .venv-neighbours/bayespbrl/bin/python benchmarks/neighbours.py run [--tasks ...] [--answers ...] [--seeds ...]
 
-`bayespbrl` is the default, `bayespbrl run TASK --answers N`, and the policy that it keeps. `posterior-ppo` is PPO on the
-utility that the same run inferred. `imitation` is the preference comparisons of the package imitation with the settings
-of its Pendulum notebook, then PPO on the learned reward. Both PPOs have the settings of that notebook, eight copies of
-the task and the same number of steps.
+`bayespbrl` is the default, as of `bayespbrl run TASK --answers N`, and the policy that it keeps. `posterior-ppo` is PPO
+on the utility that the same run inferred. `imitation` is the preference comparisons of the package imitation with the
+settings of its Pendulum notebook, then PPO on the learned reward. Both PPOs have that notebook's settings, eight copies
+of the task and 100 000 steps.
 
-What differs, because each library asks in its own way: bayespbrl shows whole episodes and may ask less than it is
-allowed; imitation compares fragments of 100 steps that are drawn at random. Both experts see the hidden reward and never
-err. imitation needs at least one answer a round, so it has as many rounds as answers, at most 60. It also needs episodes
-of equal length: CartPole is its own variant, where the pole may fall, and in the other tasks an episode that has ended
-stays where it is, without reward, until the time limit.
+Each library asks in its own way. bayespbrl shows whole episodes and may ask less than it is allowed; imitation compares
+random fragments of 100 steps. Neither expert ever errs. imitation cannot go through a round without an answer, so it
+has as many rounds as answers, at most the notebook's 60. It also needs episodes of equal length: its CartPole is the
+variant of its authors, where the pole may fall; in the other tasks an episode that has ended stays where it is, without
+reward, until the time limit.
 
-The value is the mean hidden return of 100 episodes without noise, from starts that all methods share. Steps are those of
-the environment that the learner sees, not the evaluation's; those of `posterior-ppo`, and its CPU seconds, include the
-run's. Each method runs in a process of its own, in one of the two virtual environments that `make neighbours` builds:
-imitation needs an older gymnasium than bayespbrl. A row is appended as each ends, and a second call does only what is
-missing. At the end it prints a table of medians and quartiles.
+The value is the mean hidden return of 100 episodes without noise, from starts that all methods share. Steps are those
+of the environment that the learner sees; steps and CPU seconds of `posterior-ppo` include the run's. The evaluation is
+left out of both, but bayespbrl's CPU seconds include its own evaluations of each iteration. A run that was interrupted
+counts only the CPU seconds since.
+
+Each cell is computed in a process of its own, in one of the two virtual environments that `make neighbours` builds:
+imitation needs an older gymnasium than bayespbrl. Its row is written as it ends; a second call does only what is
+missing. At the end it prints medians and quartiles. They describe few trials and are no test of a difference.
 """
 
 import argparse
@@ -37,17 +40,17 @@ import gymnasium
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
+ENVIRONMENTS, RUNS = ROOT / ".venv-neighbours", ROOT / "runs" / "neighbours"
 RESULTS = Path(__file__).parent / "results" / "neighbours.csv"
 TASKS = ("CartPole-v1", "Pendulum-v1", "MountainCarContinuous-v0", "Acrobot-v1", "MountainCar-v0")
 METHODS = {"bayespbrl": "bayespbrl", "posterior-ppo": "bayespbrl", "imitation": "imitation"}  # and their environments
-COLUMNS = ["task", "answers", "seed", "method", "answered", "value", "steps", "cpu_seconds"]
+FIGURES = ["answered", "value", "steps", "cpu_seconds"]
+COLUMNS = ["task", "answers", "seed", "method", *FIGURES]
 EPISODES, COPIES = 100, 8
-# of the Pendulum notebook of imitation 1.0.1, https://imitation.readthedocs.io, "Preference Comparisons"
-PPO_SETTINGS = {
-    **{"n_steps": 2048 // COPIES, "batch_size": 64, "n_epochs": 10, "learning_rate": 2e-3},
-    **{"ent_coef": 0.01, "clip_range": 0.1, "gae_lambda": 0.95, "gamma": 0.97},
-}
-ROUNDS, FRAGMENT, FIRST_SHARE, STEPS_WITH_ANSWERS = 60, 100, 0.1, 5000
+# of the notebook "Learning a Reward Function using Preference Comparisons" of imitation 1.0.1, by name of the argument
+PPO_SETTINGS = {"n_steps": 2048 // COPIES, "batch_size": 64, "n_epochs": 10, "learning_rate": 2e-3}
+PPO_SETTINGS |= {"ent_coef": 0.01, "clip_range": 0.1, "gae_lambda": 0.95, "gamma": 0.97}
+ROUNDS, FRAGMENT, FIRST_SHARE, STEPS_WITH_ANSWERS, STEPS = 60, 100, 0.1, 5000, 100_000
 EQUAL_LENGTH = {"CartPole-v1": "seals:seals/CartPole-v0"}
 
 
@@ -132,12 +135,11 @@ def bayespbrl_cell(cell: Cell, directory: Path, **options: Any) -> dict[str, flo
         max_steps=run.settings.rollouts.max_steps,
         starts=cell.starts,
     )
-    mean = float(np.mean([episode.total_reward for episode in episodes]))
-    answered = run.preferences.answers
-    return {"answered": answered, "value": mean, "steps": steps_of(directory), "cpu_seconds": seconds}
+    figures = {"answered": run.preferences.answers, "steps": steps_of(directory), "cpu_seconds": seconds}
+    return figures | {"value": float(np.mean([episode.total_reward for episode in episodes]))}
 
 
-def posterior_ppo_cell(cell: Cell, directory: Path, steps: int) -> dict[str, float]:
+def posterior_ppo_cell(cell: Cell, directory: Path) -> dict[str, float]:
     """The figures of PPO on the utility of the run in `directory`, without those of the run."""
     import torch
     from stable_baselines3 import PPO
@@ -147,7 +149,7 @@ def posterior_ppo_cell(cell: Cell, directory: Path, steps: int) -> dict[str, flo
     run, count = bayespbrl_run(cell, directory), [0]
 
     class Utility(VecEnvWrapper):
-        """The reward of `bayespbrl.UtilityReward`, of all copies at once and without its deviations: 50 times faster."""
+        """The reward of `bayespbrl.UtilityReward`, of all copies at once, without the slow deviations."""
 
         def reset(self) -> Any:
             return self.venv.reset()
@@ -163,7 +165,7 @@ def posterior_ppo_cell(cell: Cell, directory: Path, steps: int) -> dict[str, flo
     copies = DummyVecEnv([lambda: Counted(gymnasium.make(cell.task), count) for _ in range(COPIES)])
     tasks = VecNormalize(Utility(copies), gamma=PPO_SETTINGS["gamma"])  # the utility has no unit
     agent = PPO("MlpPolicy", tasks, seed=cell.seed, policy_kwargs={"net_arch": [32, 32]}, **PPO_SETTINGS)
-    agent.learn(steps)
+    agent.learn(STEPS)
     figures = {"answered": run.preferences.answers, "steps": count[0], "cpu_seconds": time.process_time() - began}
 
     def act(observations: np.ndarray) -> np.ndarray:
@@ -172,7 +174,7 @@ def posterior_ppo_cell(cell: Cell, directory: Path, steps: int) -> dict[str, flo
     return figures | {"value": value(cell.task, cell.starts, act)}
 
 
-def imitation_cell(cell: Cell, steps: int) -> dict[str, float]:
+def imitation_cell(cell: Cell) -> dict[str, float]:
     """The figures of imitation's preference comparisons and PPO on the reward that they learn."""
     import torch
     from imitation.algorithms import preference_comparisons as comparisons
@@ -194,30 +196,28 @@ def imitation_cell(cell: Cell, steps: int) -> dict[str, float]:
         return PPO(FeedForward32Policy, env, seed=cell.seed, policy_kwargs=policy, **PPO_SETTINGS)
 
     first_share = max(FIRST_SHARE, 1 / cell.answers)
-    trainer = comparisons.BasicRewardTrainer(
-        comparisons.PreferenceModel(reward), comparisons.CrossEntropyRewardLoss(), epochs=3, rng=rng
-    )
+    model, loss = comparisons.PreferenceModel(reward), comparisons.CrossEntropyRewardLoss()
     learner = comparisons.PreferenceComparisons(
         comparisons.AgentTrainer(ppo(tasks), reward, tasks, rng, exploration_frac=0.05),
         reward,
         num_iterations=max(1, min(ROUNDS, cell.answers - int(first_share * cell.answers))),
         fragmenter=comparisons.RandomFragmenter(rng, warning_threshold=0),
         preference_gatherer=comparisons.SyntheticGatherer(temperature=0, rng=rng),
-        reward_trainer=trainer,
+        reward_trainer=comparisons.BasicRewardTrainer(model, loss, rng, epochs=3),
         fragment_length=FRAGMENT,
         initial_comparison_frac=first_share,
         initial_epoch_multiplier=4,
     )
     learner.train(total_timesteps=STEPS_WITH_ANSWERS, total_comparisons=cell.answers)
     agent = ppo(RewardVecEnvWrapper(tasks, reward.predict_processed))
-    agent.learn(steps)
+    agent.learn(STEPS)
     seconds, answered = time.process_time(), len(learner.dataset)
 
     def act(observations: np.ndarray) -> np.ndarray:
         return agent.predict(observations, deterministic=True)[0]
 
-    mean = value(cell.task, cell.starts, act)
-    return {"answered": answered, "value": mean, "steps": count[0], "cpu_seconds": seconds}
+    figures = {"answered": answered, "steps": count[0], "cpu_seconds": seconds}
+    return figures | {"value": value(cell.task, cell.starts, act)}
 
 
 def _of_equal_length(task: str, rng: np.random.Generator, count: list[int]) -> Any:
@@ -232,18 +232,16 @@ def _of_equal_length(task: str, rng: np.random.Generator, count: list[int]) -> A
     return make_vec_env(EQUAL_LENGTH.get(task, task), rng=rng, n_envs=COPIES, post_wrappers=wrappers)
 
 
-def measured(cell: Cell, *, runs: Path, steps: int, python: Path) -> dict[str, Any]:
+def measured(cell: Cell) -> dict[str, Any]:
     """The figures of a cell from a process of its own.
 
     Raises:
       RuntimeError: it failed; says why in a line.
     """
-    arguments = [*map(str, cell), "--runs", str(runs), "--steps", str(steps)]
+    interpreter = str(ENVIRONMENTS / METHODS[cell.method] / "bin" / "python")
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    interpreter = str(python / METHODS[cell.method] / "bin" / "python")
-    process = subprocess.run(
-        [interpreter, __file__, "cell", *arguments], capture_output=True, text=True, env=os.environ | limits
-    )
+    command = [interpreter, __file__, "cell", *map(str, cell)]
+    process = subprocess.run(command, capture_output=True, text=True, env=os.environ | limits)
     if process.returncode:
         raise RuntimeError((process.stderr.strip().splitlines() or [f"exit status {process.returncode}"])[-1])
     return json.loads(process.stdout.splitlines()[-1])
@@ -255,19 +253,16 @@ def done(file: Path) -> list[dict[str, Any]]:
         return []
     with file.open() as lines:
         rows = [row for row in csv.DictReader(lines) if all(row.get(name) not in (None, "") for name in COLUMNS)]
-    text = ("task", "method")
-    return [{name: row[name] if name in text else float(row[name]) for name in COLUMNS} for row in rows]
+    return [{name: Cell.__annotations__.get(name, float)(row[name]) for name in COLUMNS} for row in rows]
 
 
-def run(cells: Sequence[Cell], file: Path, measure: Callable[[Cell], dict[str, Any]]) -> list[Cell]:
-    """Append a row for each cell that has none, and return those that failed."""
-    rows, failed = done(file), []
-    _write(file, rows)
-    have = {_cell(row): row for row in rows}
+def run(cells: Sequence[Cell], file: Path, measure: Callable[[Cell], dict[str, Any]] = measured) -> list[Cell]:
+    """Add a row for each cell that has none, as soon as it has ended, and return those that failed."""
+    have, failed = {_cell(row): row for row in done(file)}, []
     for cell in cells:
-        learned = have.get(cell._replace(method="bayespbrl"))
         if cell in have:
             continue
+        learned = have.get(cell._replace(method="bayespbrl"))
         try:
             if cell.method == "posterior-ppo" and learned is None:
                 raise RuntimeError("the run of bayespbrl that it needs has failed")
@@ -278,14 +273,13 @@ def run(cells: Sequence[Cell], file: Path, measure: Callable[[Cell], dict[str, A
             continue
         if cell.method == "posterior-ppo" and learned is not None:
             figures = figures | {name: figures[name] + learned[name] for name in ("steps", "cpu_seconds")}
-        have[cell] = cell._asdict() | {name: round(figures[name], 2) for name in COLUMNS[4:]}
-        with file.open("a", newline="") as lines:
-            csv.DictWriter(lines, COLUMNS).writerow(have[cell])
+        have[cell] = cell._asdict() | {name: round(figures[name], 2) for name in FIGURES}
+        _write(file, list(have.values()))
     return failed
 
 
 def _cell(row: dict[str, Any]) -> Cell:
-    return Cell(row["task"], int(row["answers"]), int(row["seed"]), row["method"])
+    return Cell(*(row[name] for name in Cell._fields))
 
 
 def _write(file: Path, rows: list[dict[str, Any]]) -> None:
@@ -294,28 +288,22 @@ def _write(file: Path, rows: list[dict[str, Any]]) -> None:
     with aside.open("w", newline="") as lines:
         table = csv.DictWriter(lines, COLUMNS)
         table.writeheader()
-        table.writerows(_cell(row)._asdict() | {name: row[name] for name in COLUMNS[4:]} for row in rows)
+        table.writerows(rows)
     aside.replace(file)
 
 
 def table(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """One line for each task, number of answers and method: median [lower, upper quartile], and what it cost."""
-    lines = [
-        "| task | answers | method | trials | value | worst | answered | steps | CPU minutes |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    order = {method: number for number, method in enumerate(METHODS)}
-    for task, answers, method in sorted(
-        {(row["task"], int(row["answers"]), row["method"]) for row in rows}, key=lambda key: (*key[:2], order[key[2]])
-    ):
+    """A line for each task, number of answers and method: median [lower, upper quartile], and medians of the costs."""
+    header = "| task | answers | method | trials | value | worst | answered | steps | CPU minutes |"
+    lines, order = [header, "|---|---|---|---|---|---|---|---|---|"], list(METHODS)
+    keys = {(row["task"], row["answers"], row["method"]) for row in rows}
+    for task, answers, method in sorted(keys, key=lambda key: (key[0], key[1], order.index(key[2]))):
         its = [row for row in rows if (row["task"], row["answers"], row["method"]) == (task, answers, method)]
-        low, middle, high = np.quantile([row["value"] for row in its], [0.25, 0.5, 0.75])
-        worst = min(row["value"] for row in its)
-        answered, steps, seconds = (np.median([row[name] for row in its]) for name in COLUMNS[4:] if name != "value")
-        cost = f"{answered:g} | {steps:.0f} | {seconds / 60:.1f}"
-        lines.append(
-            f"| {task} | {answers} | {method} | {len(its)} | {middle:.1f} [{low:.1f}, {high:.1f}] | {worst:.1f} | {cost} |"
-        )
+        column = {name: [row[name] for row in its] for name in FIGURES}
+        low, middle, high = np.quantile(column["value"], [0.25, 0.5, 0.75])
+        answered, steps, seconds = (np.median(column[name]) for name in ("answered", "steps", "cpu_seconds"))
+        figures = f"{middle:.1f} [{low:.1f}, {high:.1f}] | {min(column['value']):.1f} | {answered:g} | {steps:.0f}"
+        lines.append(f"| {task} | {answers:g} | {method} | {len(its)} | {figures} | {seconds / 60:.1f} |")
     return lines
 
 
@@ -328,32 +316,27 @@ def main() -> None:
     whole.add_argument("--answers", nargs="+", type=_positive, default=[4, 8, 16, 32])
     whole.add_argument("--seeds", nargs="+", type=int, default=range(3110, 3115))
     whole.add_argument("--out", type=Path, default=RESULTS)
-    whole.add_argument("--python", type=Path, default=ROOT / ".venv-neighbours", help="folder of the two environments")
     for name, kind in Cell.__annotations__.items():
-        one.add_argument(name, type=kind)
-    for command in (whole, one):
-        command.add_argument("--runs", type=Path, default=ROOT / "runs" / "neighbours", help="run directories are here")
-        command.add_argument("--steps", type=_positive, default=100_000, help="of PPO on a reward that was learned")
+        one.add_argument(name, type=kind, choices=METHODS if name == "method" else None)
     chosen = parser.parse_args()
     if chosen.command == "cell":
-        cell = Cell(chosen.task, chosen.answers, chosen.seed, chosen.method)
-        directory = chosen.runs / f"{cell.task}-{cell.answers}-{cell.seed}"
-        ways: dict[str, Callable[[], dict[str, float]]] = {
-            "bayespbrl": lambda: bayespbrl_cell(cell, directory),
-            "posterior-ppo": lambda: posterior_ppo_cell(cell, directory, chosen.steps),
-            "imitation": lambda: imitation_cell(cell, chosen.steps),
-        }
-        print(json.dumps(ways[cell.method]()))
+        print(json.dumps(figures_of(Cell(chosen.task, chosen.answers, chosen.seed, chosen.method))))
         return
     cells = [Cell(*each) for each in product(chosen.tasks, chosen.answers, chosen.seeds, METHODS)]
-    missing = set(cells) - {_cell(row) for row in done(chosen.out)}
-    if missing and any(not (chosen.python / name / "bin" / "python").exists() for name in METHODS.values()):
-        parser.error(f"{chosen.python}: expected the environments of the methods; `make neighbours` builds them")
-    failed = run(
-        cells, chosen.out, lambda cell: measured(cell, runs=chosen.runs, steps=chosen.steps, python=chosen.python)
-    )
+    missing = set(cells) - set(map(_cell, done(chosen.out)))
+    if missing and not all((ENVIRONMENTS / name / "bin" / "python").exists() for name in METHODS.values()):
+        parser.error(f"{ENVIRONMENTS}: expected the methods' environments, got none; `make neighbours` builds them")
+    failed = run(cells, chosen.out)
     print("\n".join(table([row for row in done(chosen.out) if _cell(row) in cells])))
     sys.exit(bool(failed))
+
+
+def figures_of(cell: Cell) -> dict[str, float]:
+    """The figures of a cell, in this process."""
+    if cell.method == "imitation":
+        return imitation_cell(cell)
+    directory = RUNS / f"{cell.task}-{cell.answers}-{cell.seed}"
+    return (bayespbrl_cell if cell.method == "bayespbrl" else posterior_ppo_cell)(cell, directory)
 
 
 def _positive(text: str) -> int:
