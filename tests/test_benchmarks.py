@@ -245,6 +245,7 @@ def cells(neighbours):
     return [neighbours.Cell("gridworld", 3, seed, method) for seed in (7, 8) for method in neighbours.METHODS]
 
 
+@pytest.mark.slow
 def test_a_learner_is_charged_for_its_trajectories_and_for_the_trials_of_its_policies(neighbours, cells, tmp_path):
     directory = tmp_path / "run"
     options = {name: option for name, option in QUICK.items() if name != "seed"}
