@@ -35,8 +35,9 @@ results: $(VENV)/.installed
 results-check: $(VENV)/.installed
 	$(BIN)/python benchmarks/results_page.py --check
 
-# Beside imitation's preference comparisons. imitation needs an older gymnasium than bayespbrl, so each has an environment
-# of its own. PyTorch's build without CUDA suffices: TORCH= takes another requirement, or an address of a wheel.
+# Beside imitation's preference comparisons. Each library has an environment of its own, because imitation needs an older
+# gymnasium and a NumPy that there is for Python 3.11 and 3.12. PyTorch without CUDA suffices: TORCH= takes another
+# requirement, or a path to a wheel.
 NEIGHBOURS := .venv-neighbours
 TORCH ?= torch>=2.8,<3
 
@@ -46,7 +47,7 @@ $(NEIGHBOURS)/.installed: pyproject.toml Makefile
 	  $(NEIGHBOURS)/$$name/bin/python -m pip install --quiet --disable-pip-version-check '$(TORCH)' || exit 1; \
 	done
 	$(NEIGHBOURS)/bayespbrl/bin/python -m pip install --quiet --disable-pip-version-check 'stable-baselines3>=2.6,<3' -e .
-	$(NEIGHBOURS)/imitation/bin/python -m pip install --quiet --disable-pip-version-check 'imitation>=1.0.1,<1.1'
+	$(NEIGHBOURS)/imitation/bin/python -m pip install --quiet --disable-pip-version-check 'imitation>=1.0.1,<1.1' 'numpy<2'
 	touch $@
 
 neighbours: $(NEIGHBOURS)/.installed

@@ -20,8 +20,8 @@ left out of both, but bayespbrl's CPU seconds include its own evaluations of eac
 counts only the CPU seconds since.
 
 Each cell is computed in a process of its own, in one of the two virtual environments that `make neighbours` builds:
-imitation needs an older gymnasium than bayespbrl. Its row is written as it ends; a second call does only what is
-missing. At the end it prints medians and quartiles. They describe few trials and are no test of a difference.
+imitation needs an older gymnasium and NumPy than bayespbrl. Its row is written as it ends; a second call does only what
+is missing. At the end it prints medians and quartiles. They describe few trials and are no test of a difference.
 """
 
 import argparse
