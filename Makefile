@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # plugins only xdist is loaded: importing the others takes each process seconds.
 PYTEST := PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -p xdist -q -n auto --maxprocesses 8 --dist worksteal
 
-.PHONY: run test check fast results results-check
+.PHONY: run test check fast results results-check neighbours
 .DEFAULT_GOAL := run
 
 $(VENV)/.installed: pyproject.toml
@@ -34,3 +34,21 @@ results: $(VENV)/.installed
 
 results-check: $(VENV)/.installed
 	$(BIN)/python benchmarks/results_page.py --check
+
+# Beside imitation's preference comparisons. Each library has an environment of its own, because imitation needs an older
+# gymnasium and a NumPy that there is for Python 3.11 and 3.12. PyTorch without CUDA suffices: TORCH= takes another
+# requirement, or a path to a wheel.
+NEIGHBOURS := .venv-neighbours
+TORCH ?= torch>=2.8,<3
+
+$(NEIGHBOURS)/.installed: pyproject.toml Makefile
+	for name in bayespbrl imitation; do \
+	  test -x $(NEIGHBOURS)/$$name/bin/python || $(PYTHON) -m venv $(NEIGHBOURS)/$$name || exit 1; \
+	  $(NEIGHBOURS)/$$name/bin/python -m pip install --quiet --disable-pip-version-check '$(TORCH)' || exit 1; \
+	done
+	$(NEIGHBOURS)/bayespbrl/bin/python -m pip install --quiet --disable-pip-version-check 'stable-baselines3>=2.6,<3' -e .
+	$(NEIGHBOURS)/imitation/bin/python -m pip install --quiet --disable-pip-version-check 'imitation>=1.0.1,<1.1' 'numpy<2'
+	touch $@
+
+neighbours: $(NEIGHBOURS)/.installed
+	$(NEIGHBOURS)/bayespbrl/bin/python benchmarks/neighbours.py run $(OPTIONS)

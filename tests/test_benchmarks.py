@@ -7,10 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
+from toys import QUICK
 
+import bayespbrl
 from bayespbrl.models import PreferenceModel, fit_gaussian, sample_posterior
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -230,3 +233,92 @@ def test_the_study_of_simulated_people_goes_on_where_it_was_cut(tmp_path, capsys
     assert [row["seed"] for row in study.done(file)] == [5, 6]
     study.show(rows)
     assert capsys.readouterr().out.startswith("2 runs, 2 converged")
+
+
+@pytest.fixture(scope="module")
+def neighbours():
+    return benchmark("neighbours")
+
+
+@pytest.fixture
+def cells(neighbours):
+    return [neighbours.Cell("gridworld", 3, seed, method) for seed in (7, 8) for method in neighbours.METHODS]
+
+
+@pytest.mark.slow
+def test_a_learner_is_charged_for_its_trajectories_and_for_the_trials_of_its_policies(neighbours, cells, tmp_path):
+    directory = tmp_path / "run"
+    options = {name: option for name, option in QUICK.items() if name != "seed"}
+    figures = neighbours.bayespbrl_cell(cells[0], directory, **options, checked=True, check_episodes=2)
+    run = bayespbrl.load(directory)
+    assert run.settings.seed == 7
+    assert figures["steps"] == 3 * (10 + 2) * 20  # iterations, their trajectories and trials, steps of each
+    assert figures["answered"] == run.preferences.answers > 0
+    assert figures["cpu_seconds"] > 0
+    # the same 100 starts, and the finished run is read, not made again
+    changed = (directory / "events.jsonl").stat().st_mtime_ns
+    assert neighbours.bayespbrl_cell(cells[0], directory)["value"] == figures["value"]
+    assert (directory / "events.jsonl").stat().st_mtime_ns == changed
+
+
+def test_a_value_is_the_mean_return_of_episodes_of_different_lengths(neighbours):
+    def act(observations):
+        return (observations[:, 2] > 0).astype(int)  # after the pole
+
+    returns = []
+    for seed in (3, 4, 5):
+        env, total, over = gymnasium.make("CartPole-v1"), 0.0, False
+        seen, _ = env.reset(seed=seed)
+        while not over:
+            seen, reward, terminated, truncated, _ = env.step(act(seen[None])[0])
+            total, over = total + reward, terminated or truncated
+        returns.append(total)
+    assert len(set(returns)) > 1
+    assert neighbours.value("CartPole-v1", range(3, 6), act) == pytest.approx(np.mean(returns))
+
+
+def test_a_cell_of_the_neighbours_is_computed_once(neighbours, cells, tmp_path, capsys):
+    file, asked = tmp_path / "rows.csv", []
+
+    def measure(cell):
+        asked.append(cell)
+        if cell.seed == 8 and cell.method != "imitation":
+            raise RuntimeError("no luck")
+        number = list(neighbours.METHODS).index(cell.method)
+        return {"answered": 3, "value": -number, "steps": 100 + number, "cpu_seconds": 60 + number}
+
+    assert neighbours.run(cells[:2], file, measure) == []
+    first, second = neighbours.done(file)
+    assert first == cells[0]._asdict() | {"answered": 3, "value": 0, "steps": 100, "cpu_seconds": 60}
+    # PPO on the utility of a run needs that run
+    assert second == cells[1]._asdict() | {"answered": 3, "value": -1, "steps": 201, "cpu_seconds": 121}
+    with file.open("a") as rows:
+        rows.write("gridworld,3,7,imitation,3")  # killed while it wrote
+    assert neighbours.run(cells, file, measure) == [cells[3], cells[4]]
+    assert asked == [*cells[:4], cells[5]]  # what needs a failed run is not begun
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[0] == "failed: gridworld 3 8 bayespbrl: no luck"
+    assert printed[1] == "failed: gridworld 3 8 posterior-ppo: the run of bayespbrl that it needs has failed"
+    assert neighbours.table(neighbours.done(file))[2:] == [
+        "| gridworld | 3 | bayespbrl | 1 | 0.0 [0.0, 0.0] | 0.0 | 3 | 100 | 1.0 |",
+        "| gridworld | 3 | posterior-ppo | 1 | -1.0 [-1.0, -1.0] | -1.0 | 3 | 201 | 2.0 |",
+        "| gridworld | 3 | imitation | 2 | -2.0 [-2.0, -2.0] | -2.0 | 3 | 102 | 1.0 |",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--tasks", "Pendulum"], "argument --tasks: invalid choice: 'Pendulum'"),
+        (["--answers", "0"], "argument --answers: expected a whole number from 1 up, got 0"),
+        (["--seeds", "first"], "argument --seeds: invalid int value: 'first'"),
+        ([], "expected the methods' environments, got none; `make neighbours` builds them"),
+    ],
+)
+def test_wrong_options_of_the_neighbours_are_one_line(neighbours, tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.setattr(neighbours, "ENVIRONMENTS", tmp_path / "none")
+    monkeypatch.setattr(sys, "argv", ["neighbours.py", "run", "--out", str(tmp_path / "rows.csv"), *options])
+    with pytest.raises(SystemExit) as refused:
+        neighbours.main()
+    assert refused.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]

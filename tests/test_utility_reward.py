@@ -38,6 +38,8 @@ def test_a_step_earns_the_utility_of_the_next_state_and_tells_the_true_reward(pe
         assert reward == pytest.approx(pendulum.estimate.utilities(observation[None].astype(float))[0])
         draws = pendulum.estimate.utilities_and_draws(observation[None].astype(float))[1]
         assert info["utility_deviation"] == pytest.approx(draws.std(), rel=0.2)
+        few = pendulum.estimate.utilities_and_draws(observation[None].astype(float), number=200)[1]
+        assert info["utility_deviation"] == pytest.approx(few.std(), rel=1e-5)
 
 
 def test_caution_subtracts_standard_deviations(pendulum):

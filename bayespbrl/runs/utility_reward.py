@@ -1,13 +1,16 @@
 """The inferred utility as the reward of an environment, for any library that learns from rewards."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
+import xarray as xr
 
 from bayespbrl import checks
 from bayespbrl.envs.opening import to_plain
 from bayespbrl.runs.run import Run
+from bayespbrl.utility.posterior_utility import PosteriorUtility, spacing
 
 DRAWS = 200  # for the standard deviation: known to a twentieth
 
@@ -43,6 +46,7 @@ class UtilityReward(gymnasium.Wrapper):
         self.caution = float(caution)
         if self.caution and self.estimate.posterior is None:
             raise ValueError("caution: expected 0 for an estimate without a posterior")
+        self._thinned = _thinned(self.estimate) if isinstance(self.estimate, PosteriorUtility) else None
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """As of the environment, with the utility as the reward."""
@@ -52,8 +56,15 @@ class UtilityReward(gymnasium.Wrapper):
         return observation, utility - self.caution * deviation, terminated, truncated, info
 
     def _utility(self, states: np.ndarray) -> tuple[float, float]:
-        assert self.estimate is not None
-        if self.estimate.posterior is None:
-            return float(self.estimate.utilities(states)[0]), 0.0  # type: ignore[attr-defined]
-        mean, draws = self.estimate.utilities_and_draws(states, number=DRAWS)
+        if self._thinned is None:
+            return float(self.estimate.utilities(states)[0]), 0.0  # type: ignore[union-attr]
+        mean, draws = self._thinned.utilities_and_draws(states)
         return float(mean[0]), float(draws[:, 0].std())
+
+
+def _thinned(estimate: PosteriorUtility) -> PosteriorUtility:
+    """The estimate with `DRAWS` of its draws, computed once: where they are indexed they would be, at each step."""
+    drawn = estimate.posterior["posterior"].dataset[["setting", "utility_weights"]]
+    apart = spacing(drawn["setting"].size, DRAWS)
+    few = drawn.isel(draw=slice(None, None, apart)).load()
+    return replace(estimate, posterior=xr.DataTree.from_dict({"posterior": few}))
