@@ -20,7 +20,8 @@ from bayespbrl.people.drawing import SCENES
 from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
-from bayespbrl.people.session import FINISHED, QUESTION, Session, Stale, answer_of
+from bayespbrl.people.session import Session, Stale, answer_of
+from bayespbrl.people.views import FINISHED, QUESTION
 from bayespbrl.people.widget import ComparisonWidget
 from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.lock import continuing
@@ -190,7 +191,7 @@ def test_practice_questions_are_about_other_trajectories_where_there_are_enough(
 
 
 def test_a_quiet_line_now_and_then_says_that_a_person_may_pause(sitting, monkeypatch):
-    monkeypatch.setattr("bayespbrl.people.session.BREAK", 2)
+    monkeypatch.setattr("bayespbrl.people.views.BREAK", 2)
     session, notices = sitting(bayespbrl.Learner("gridworld", expert="other", **QUICK)), []
     while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
         notices.append(view["notice"])

@@ -6,44 +6,23 @@ answer is in the log, flushed, before `answer` returns. While a person looks, th
 turns record nothing.
 """
 
-import re
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from bayespbrl import checks, events, queries, questions
-from bayespbrl.envs.opening import environment_name
+from bayespbrl import checks, events
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.learner import Learner
-from bayespbrl.models.likelihoods import prob
+from bayespbrl.people import views
 from bayespbrl.people.clips import Clip, Clips
 from bayespbrl.people.foresight import Foresight, Moment
 from bayespbrl.people.practice import Introduction
+from bayespbrl.people.views import FAILED, FINISHED, INSTRUCTIONS, NOTHING_SAID, QUESTION, THINKING, Shown, View
 from bayespbrl.preferences import Answer, parse_answer
-
-View = Mapping[str, Any]
-INSTRUCTIONS, THINKING, QUESTION, FINISHED, FAILED = "instructions", "thinking", "question", "finished", "failed"
-# An answer that is expected to tell less changes little: then the page says that a person may stop.
-LITTLE = questions.LEAST_INFORMATION / np.log(2)  # bits
-BREAK = 20  # answers of a sitting between two reminders that a person may pause
 
 
 class Stale(ValueError):
     """An answer to a turn that is over, as from a second window."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """What a person is shown of a question: the clips, and what the learner says about it, as plain data."""
-
-    clips: tuple[Clip, Clip]
-    said: View
-
-
-NOTHING_SAID: View = {"worth": None, "sure": None, "advice": ""}
 
 
 class Session:
@@ -230,42 +209,17 @@ class Session:
     # What is shown.
 
     def _show(self, state: LearnerState) -> tuple[Shown, tuple[Answer, ...]]:
-        """The clips of the question that waits, and the answers to it, the likeliest first and a tie last."""
+        """What a person is shown of the question that waits, and the answers to it, the likeliest first."""
         query = state.query
         assert query is not None
         if self._introduction is not None and self._introduction.clips is None:
             self._introduction.draw(self._clips, state)
-        clips = self._clips.of(query, state)
-        said = dict(NOTHING_SAID)
-        first = 0.5
-        if state.estimate is not None and state.estimate.posterior is not None:
-            draws = state.estimate.trajectory_draws(query.trajectories, number=queries.QUERY_DRAWS)
-            likelihood = state.estimate.likelihood(queries.QUERY_DRAWS)
-            first = float(prob(likelihood, draws[:, :1] - draws[:, 1:]).mean())
-            worth = queries.expected_information(draws[:, :1], draws[:, 1:], likelihood=likelihood)
-            said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
-            if said["worth"] < LITTLE:
-                said["advice"] = (
-                    f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
-                )
-        likely = (Answer.FIRST, Answer.SECOND) if first >= 0.5 else (Answer.SECOND, Answer.FIRST)
-        return Shown(clips, said), (*likely, Answer.SKIP, Answer.TIE)  # after a skip there is little to compute
+        said, likely = views.said_of(query, state)
+        return Shown(self._clips.of(query, state), said), likely
 
     def _described(self, phase: str, state: LearnerState | None = None) -> dict[str, Any]:
-        state, settings = state or self.learner.state, self.learner.settings
-        return {
-            "phase": phase,
-            "turn": self._turn,
-            "task": re.sub(r"^bayespbrl/|-v\d+$", "", environment_name(self.learner.environment)),
-            "answered": state.preferences.answers,
-            "budget": settings.questions.answers,
-            "iteration": state.iteration,
-            "undo": state.previous is not None and state.past[-1].answerer == self.answerer,
-            "answerer": self.answerer,
-            "practice": None,
-            "notice": "",
-            "say": "",
-        }
+        state = state or self.learner.state
+        return views.described(self.learner, state, phase, turn=self._turn, answerer=self.answerer)
 
     @property
     def _introducing(self) -> Introduction | None:
@@ -291,35 +245,14 @@ class Session:
         given = state.preferences.answers - self._before
         done = self.most_answers is not None and given >= self.most_answers
         if state.query is None or done:
-            self._set(self._described(FINISHED, state) | {"say": self._ending(state)})
+            self._set(self._described(FINISHED, state) | {"say": views.ending(self.learner, state, given)})
             return
-        notice = ""
-        if given > 0 and given % BREAK == 0:
-            notice = f"You have given {given} answers. Pause when you like; nothing is lost."
-        elif not given and self._introduction is not None:
-            notice = "The practice is over. From now on your answers are kept."
+        notice = views.notice(given, practised=self._introduction is not None)
         self._ask(self._described(QUESTION, state) | {"notice": notice}, moment.shown)
 
     def _ask(self, view: View, shown: Shown) -> None:
         self._sheets = self._turn, shown.clips
-        clips = [clip.described() for clip in shown.clips]
-        self._set({**view, "clips": clips, "rate": self._clips.rate(shown.clips), **shown.said})
-
-    def _ending(self, state: LearnerState) -> str:
-        """Why there is no further question."""
-        answers, budget = state.preferences.answers, self.learner.settings.questions.answers
-        if state.query is not None:
-            return (
-                f"These were the {answers - self._before} answers of this sitting. Thank you! The run can go on later."
-            )
-        if budget is not None and answers >= budget:
-            return f"All {answers} answers are given, and the policy has caught up with them. Thank you!"
-        if state.iteration >= self.learner.settings.most_iterations:
-            return f"The run has done its {state.iteration} iterations, with {answers} answers. Thank you!"
-        return (
-            f"The learner can foresee your answers: none was worth {LITTLE:.2f} bit in the last {state.unasked} "
-            f"iterations. It stops after {answers} answers. Thank you!"
-        )
+        self._set(views.with_question(view, shown, self._clips.rate(shown.clips)))
 
     def _set(self, view: View) -> None:
         if view == self._view:
