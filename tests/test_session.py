@@ -20,7 +20,8 @@ from bayespbrl.people.drawing import SCENES
 from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
-from bayespbrl.people.session import Session, Stale, answer_of
+from bayespbrl.people.seat import Stale
+from bayespbrl.people.session import Session, answer_of
 from bayespbrl.people.views import FINISHED, QUESTION
 from bayespbrl.people.widget import ComparisonWidget
 from bayespbrl.preferences import Answer, Query
@@ -57,14 +58,17 @@ def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitti
     session = sitting(bayespbrl.Learner("gridworld", **options), answerer="Ada")
     ahead = []
     while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
-        moment = session._foresight.present
-        with session._changed:  # until the thread has foreseen both likely answers
-            foreseen = session._changed.wait_for(
-                lambda now=moment: len(now.after) >= 2 and all(now.after[a].complete for a in now.likely[:2]), WAIT
+        moment, number = session._foresight.present, session.learner.state.query.number
+        with session.changed:  # until the thread has foreseen both likely answers
+            foreseen = session.changed.wait_for(
+                lambda now=moment, n=number: (
+                    len(now.after) >= 2 and all(now.after[n, a].complete for a in now.likely[n][:2])
+                ),
+                WAIT,
             )
         assert foreseen
         given = bayespbrl.ReturnExpert()(*session.learner.state.query.trajectories)
-        ahead.append(given in moment.after and moment.after[given].complete)
+        ahead.append((number, given) in moment.after and moment.after[number, given].complete)
         session.answer(view["turn"], str(given), 1.5)
     plain = bayespbrl.Learner("gridworld", **options).run(bayespbrl.ReturnExpert(), answerer="Ada")
     assert fingerprint(session.learner) == fingerprint(plain)
@@ -74,7 +78,7 @@ def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitti
 def test_a_tie_is_foreseen_last_until_the_run_has_one():
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
     answers = tuple(map(Answer, ("second", "first", "skip", "tie")))
-    foresight = Foresight(learner.cycle, learner.state, lambda state: ("shown", answers))
+    foresight = Foresight(learner.cycle, learner.state, lambda state, query: ("shown", answers))
 
     def foreseen(number):
         """The answers after which the next moments are foreseen."""
@@ -85,11 +89,11 @@ def test_a_tie_is_foreseen_last_until_the_run_has_one():
                 foresight.keep(moment, entry)
             if moment.complete:
                 after = foresight.present.after.items()
-                order.append(next((str(answer) for answer, known in after if known is moment), "other"))
+                order.append(next((str(answer) for (_, answer), known in after if known is moment), "other"))
         return order
 
     assert foreseen(9) == ["other", "second", "first", "skip", *["other"] * 4, "tie"]
-    present = foresight.move(Answer.TIE, foresight.present.after[Answer.TIE].state)
+    present = foresight.move(1, Answer.TIE, foresight.present.after[1, Answer.TIE].state)
     assert present.complete
     assert foreseen(4) == ["second", "first", "skip", "tie"]
 
@@ -100,8 +104,8 @@ def test_nothing_reaches_the_log_before_the_answer(sitting, tmp_path):
     session.wait(timeout=WAIT)
     before = learner.log.log_file.read_bytes()
     moment = session._foresight.present
-    with session._changed:
-        assert session._changed.wait_for(lambda: len(moment.after) > 1, WAIT)
+    with session.changed:
+        assert session.changed.wait_for(lambda: len(moment.after) > 1, WAIT)
     assert learner.log.log_file.read_bytes() == before
 
 
@@ -180,7 +184,7 @@ def test_practice_questions_are_about_other_trajectories_where_there_are_enough(
     def asked(number, first, second):
         both = (trajectories[first], trajectories[second])
         state = LearnerState(
-            None, trajectories=tuple(trajectories[:number]), query=Query(1, first, second, second, both)
+            None, trajectories=tuple(trajectories[:number]), open=(Query(1, first, second, second, both),)
         )
         return [(query.first, query.second) for query in practice_queries(state)]
 

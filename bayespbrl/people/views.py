@@ -17,6 +17,7 @@ from bayespbrl.preferences import Answer, Query
 
 View = Mapping[str, Any]
 INSTRUCTIONS, THINKING, QUESTION, FINISHED, FAILED = "instructions", "thinking", "question", "finished", "failed"
+WAITING = "waiting"  # the questions that are left lie with others
 # An answer that is expected to tell less changes little: then the page says that a person may stop.
 LITTLE = questions.LEAST_INFORMATION / np.log(2)  # bits
 BREAK = 20  # answers of a sitting between two reminders that a person may pause
@@ -30,6 +31,7 @@ class Shown:
     said: View
 
 
+NOTHING_LEFT = "Others are answering the last questions. Wait, in case one of them leaves, or close this page."
 NOTHING_SAID: View = {"worth": None, "sure": None, "advice": ""}
 
 
@@ -82,7 +84,7 @@ def notice(given: int, *, practised: bool) -> str:
 def ending(learner: Learner, state: LearnerState, given: int) -> str:
     """Why there is no further question, after so many answers of a sitting."""
     answers, budget = state.preferences.answers, learner.settings.questions.answers
-    if state.query is not None:
+    if not state.finished(learner.settings):
         return f"These were the {given} answers of this sitting. Thank you! The run can go on later."
     if budget is not None and answers >= budget:
         return f"All {answers} answers are given, and the policy has caught up with them. Thank you!"
