@@ -185,7 +185,9 @@ class Cycle:
         shown = {"first": query.first, "second": query.second, "newcomer": newcomer}
         event = {"event": "asked", "query": number, **shown, **who}
         if options.same_start:
-            event["rivals"] = rivals(query, state.trajectories, state.preferences)
+            beside = rivals(query, state.trajectories, state.preferences)
+            tied = beside if answerer is None else state.preferences.tied_with(incumbent)
+            event["rivals"] = [number for number in beside if number in tied]
         return _entry(event)
 
     def improve(self, state: LearnerState) -> Entry:
@@ -272,7 +274,7 @@ class Cycle:
                 discount=settings.trajectory_discount,
             ),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),
-            settings.estimation,
+            settings.estimation.after(settings.questions.left(known.answers)),
             settings.model,
             seed=int(self._rng(FIT, state.iteration).integers(2**31)),
         )

@@ -15,6 +15,7 @@ from toys import QUICK, Slope, fingerprint
 import bayespbrl
 from bayespbrl.cli.commands import main
 from bayespbrl.events import LearnerState
+from bayespbrl.models.likelihoods import Logistic
 from bayespbrl.people.clips import MOST_BYTES, Clips
 from bayespbrl.people.drawing import SCENES
 from bayespbrl.people.foresight import Foresight
@@ -22,7 +23,7 @@ from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session, answer_of
-from bayespbrl.people.views import FINISHED, QUESTION
+from bayespbrl.people.views import FINISHED, QUESTION, with_ties
 from bayespbrl.people.widget import ComparisonWidget
 from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.lock import continuing
@@ -96,6 +97,23 @@ def test_a_tie_is_foreseen_last_until_the_run_has_one():
     present = foresight.move(1, Answer.TIE, foresight.present.after[1, Answer.TIE].state)
     assert present.complete
     assert foreseen(4) == ["second", "first", "skip", "tie"]
+
+
+@pytest.mark.parametrize(
+    ("margin", "threshold", "order"),
+    [
+        (0.0, None, "second first skip tie"),
+        (0.1, 1.0, "tie first skip second"),
+        (-0.1, 1.0, "tie second skip first"),
+        (2.0, 1.0, "first tie skip second"),
+        (0.2, 0.01, "first second skip tie"),
+    ],
+)
+def test_a_tie_is_foreseen_as_early_as_it_is_likely_once_the_run_has_one(margin, threshold, order):
+    before = tuple(map(Answer, ("second", "first", "skip", "tie")))
+    thresholds = None if threshold is None else np.full((5, 1), threshold)
+    likely = with_ties(before, np.full((5, 1), margin), Logistic(4.0), thresholds)
+    assert " ".join(likely) == order
 
 
 def test_nothing_reaches_the_log_before_the_answer(sitting, tmp_path):

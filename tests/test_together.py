@@ -38,9 +38,9 @@ def sitting(tmp_path):
 
 
 def settled(session):
-    """Wait until everybody is shown something and what follows is computed."""
+    """Wait until everybody is shown something."""
     with session.changed:
-        assert session.changed.wait_for(lambda: session.over or session.idle, WAIT)
+        assert session.changed.wait_for(lambda: all(seat.view["phase"] in SEEN for seat in session.seats), WAIT)
 
 
 def query_of(seat):

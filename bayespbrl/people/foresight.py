@@ -26,7 +26,7 @@ class Moment:
       entries: the events since the answer.
       settled: whether everybody has a question, or there is none for those without.
       shown: what is shown of each question, by its number; none until it is drawn.
-      likely: the answers to each, the likeliest first and a tie last.
+      likely: the answers to each, the likeliest first.
       after: what follows an answer to a question.
       failed: whether computing it raised; then it is computed again when the answer is there.
     """
@@ -56,7 +56,7 @@ class Foresight:
 
     Args:
       cycle: of the learner.
-      show: what is shown of a question in a state, and the answers to it: the likeliest first, a tie last.
+      show: what is shown of a question in a state, and the answers to it, the likeliest first.
       people: who are here; (None,) is one person without a name. Each gets a question of their own.
       several: whether there may be others than these.
       most: answers of the run after which the sitting is over.
@@ -159,7 +159,7 @@ class Foresight:
     def _ahead(self) -> Iterator[Moment]:
         """The moments after each answer, and those after two likely ones.
 
-        A tie comes last where the run has none yet: an iteration follows it, which takes seconds.
+        The last answer is a tie where the run has none yet. It comes at the end then: seconds of compilation follow.
         """
         following, questions = list(self._after(self.present, len(Answer))), len(self.present.holders)
         soon = len(following) if self.present.state.preferences.ties else (LIKELY + 1) * questions

@@ -1,21 +1,33 @@
 """One person of a sitting: who they are, what they are shown, and at which turn they are."""
 
+import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from bayespbrl.people.clips import Clip
 from bayespbrl.people.practice import Introduction
 from bayespbrl.people.views import FAILED, FINISHED, QUESTION, THINKING, View
-
-if TYPE_CHECKING:
-    from bayespbrl.people.session import Session
 
 AWAY = 20.0  # seconds after the last window is closed until the question can be taken by another; a reload takes less
 
 
 class Stale(ValueError):
     """An answer to a turn that is over, as from a second window."""
+
+
+class Sitting(Protocol):
+    """What a person asks of the session of all (`people.session`)."""
+
+    changed: threading.Condition
+
+    def gather(self) -> None:
+        """See who is here."""
+        ...
+
+    def take(self, seat: "Seat", turn: int, answer: str, seconds: float | None) -> None:
+        """What `Seat.answer` does."""
+        ...
 
 
 class Seat:
@@ -30,7 +42,7 @@ class Seat:
       view: what a page or widget shows now, as plain data; never changed, only replaced.
     """
 
-    def __init__(self, session: "Session", answerer: str | None, turn: int, introduction: Introduction | None):
+    def __init__(self, session: Sitting, answerer: str | None, turn: int, introduction: Introduction | None):
         self.session, self.answerer, self.introduction = session, answerer, introduction
         self.turn = turn
         self.number: int | None = None

@@ -11,9 +11,10 @@ from bayespbrl import queries, questions
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.events import LearnerState
 from bayespbrl.learner import Learner
-from bayespbrl.models.likelihoods import prob
+from bayespbrl.models.likelihoods import Likelihood, prob
 from bayespbrl.people.clips import Clip
 from bayespbrl.preferences import Answer, Query
+from bayespbrl.utility.posterior_utility import PosteriorUtility
 
 View = Mapping[str, Any]
 INSTRUCTIONS, THINKING, QUESTION, FINISHED, FAILED = "instructions", "thinking", "question", "finished", "failed"
@@ -32,6 +33,8 @@ class Shown:
 
 
 NOTHING_LEFT = "Others are answering the last questions. Wait, in case one of them leaves, or close this page."
+# The answers, the likeliest first, where nothing is known. After a skip there is little to compute.
+UNKNOWN: tuple[Answer, ...] = (Answer.FIRST, Answer.SECOND, Answer.SKIP, Answer.TIE)
 NOTHING_SAID: View = {"worth": None, "sure": None, "advice": ""}
 
 
@@ -58,20 +61,44 @@ def with_question(view: View, shown: Shown, rate: float) -> View:
 
 
 def said_of(query: Query, state: LearnerState) -> tuple[View, tuple[Answer, ...]]:
-    """What the learner says about a question, and the answers to it, the likeliest first and a tie last."""
-    said, first = dict(NOTHING_SAID), 0.5
+    """What the learner says about a question, and the answers to it, the likeliest first.
+
+    A tie comes last while the run has none.
+    """
+    said, likely = dict(NOTHING_SAID), UNKNOWN
     if state.estimate is not None and state.estimate.posterior is not None:
         draws = state.estimate.trajectory_draws(query.trajectories, number=queries.QUERY_DRAWS)
         likelihood = state.estimate.likelihood(queries.QUERY_DRAWS)
-        first = float(prob(likelihood, draws[:, :1] - draws[:, 1:]).mean())
+        margins = draws[:, :1] - draws[:, 1:]
+        first = float(prob(likelihood, margins).mean())
         worth = queries.expected_information(draws[:, :1], draws[:, 1:], likelihood=likelihood)
         said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
         if said["worth"] < LITTLE:
             said["advice"] = (
                 f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
             )
-    likely = (Answer.FIRST, Answer.SECOND) if first >= 0.5 else (Answer.SECOND, Answer.FIRST)
-    return said, (*likely, Answer.SKIP, Answer.TIE)  # after a skip there is little to compute
+        likely = UNKNOWN if first >= 0.5 else (Answer.SECOND, Answer.FIRST, *UNKNOWN[2:])
+        if isinstance(state.estimate, PosteriorUtility):
+            likely = with_ties(likely, margins, likelihood, state.estimate.tie_thresholds(queries.QUERY_DRAWS))
+    return said, likely
+
+
+def with_ties(
+    likely: tuple[Answer, ...], margins: np.ndarray, likelihood: Likelihood, thresholds: np.ndarray | None
+) -> tuple[Answer, ...]:
+    """The answers in the order of their probability, once the run has ties; a skip, which costs little, comes third.
+
+    Args:
+      likely: the order without ties.
+      margins: posterior draws of the utility of the first over that of the second, shape (S, 1).
+      likelihood, thresholds: of the next answer; None where no answer was a tie.
+    """
+    if thresholds is None:
+        return likely
+    first, second = (float(prob(likelihood, sign * margins - thresholds).mean()) for sign in (1, -1))
+    chances = {Answer.FIRST: first, Answer.SECOND: second, Answer.TIE: 1 - first - second}
+    ordered = sorted(chances, key=lambda answer: -chances[answer])
+    return (*ordered[:2], Answer.SKIP, ordered[2])
 
 
 def notice(given: int, *, practised: bool) -> str:
