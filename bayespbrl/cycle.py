@@ -60,13 +60,38 @@ class Cycle:
         if steps is not None and steps > (limit := rollouts.step_limit(self.environment, options.max_steps)):
             raise ValueError(f"clip_steps: expected at most {limit}, the steps of an episode, got {steps}")
 
-    def next(self, state: LearnerState) -> Entry | None:
-        """What happens next without an answer; None where a question waits for one, or the run is finished."""
-        if state.query is not None or state.finished(self.settings):
+    def next(self, state: LearnerState, answerer: str | None = None, *, others: int | None = None) -> Entry | None:
+        """What happens next without an answer; None where a question waits for one, or the run is finished.
+
+        Where several people answer at once, each answer is followed by what would follow it if nobody else were there:
+        the iteration goes on while the others look at their questions, so that nobody waits for another.
+
+        Args:
+          answerer: of several people, one without a question, who is asked next.
+          others: at how many questions the others are looking; None: only one person answers. No more is asked than
+            the budget has left, and in the last iteration no more than it wants. Then the result is None too.
+        """
+        if state.finished(self.settings) or (others is None and state.open):
             return None
         if not state.collected:
             return self.collect(state)
-        return self.show(state) if state.wanted and state.candidates else self.improve(state)
+        newcomers = self._newcomers(state)
+        if not state.wanted or not (newcomers or others):
+            return self.improve(state)
+        if others:
+            room = self.settings.questions.left(state.preferences.answers)
+            if state.iteration + 1 >= self.settings.most_iterations:
+                room = min(room, state.wanted)
+            if room <= others or not newcomers:
+                return None
+        return self.show(state, answerer)
+
+    def _newcomers(self, state: LearnerState) -> list[int]:
+        """The candidates about whom, with their opponents, no open question is."""
+        taken, last = [{query.first, query.second} for query in state.open], state.preferences.undominated[-1:]
+        newcomers = {query.newcomer for query in state.open}
+        pairs = {number: {number, state.opponents.get(number, *last)} for number in state.candidates}
+        return [number for number, pair in pairs.items() if number not in newcomers and pair not in taken]
 
     def collect(self, state: LearnerState) -> Entry:
         """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
@@ -146,19 +171,23 @@ class Cycle:
             return self._starts(iteration)[episode]
         return rollouts.reset_seed(self._key(COLLECT, iteration)) + episode
 
-    def show(self, state: LearnerState) -> Entry:
+    def show(self, state: LearnerState, answerer: str | None = None) -> Entry:
         """Step 4: the next question, the best candidate against its opponent, or a repeated one; `asked`."""
-        number, newcomer, options = state.queries + 1, state.candidates[0], self.settings.questions
-        left = options.left(state.preferences.answers + state.wanted)
-        again = questions.repeated(state.past, number, options, left=left, rng=self._rng(REPEAT, number))
+        number, newcomer, options = state.queries + 1, self._newcomers(state)[0], self.settings.questions
+        left = options.left(state.preferences.answers + state.wanted + len(state.open))
+        rng, who = self._rng(REPEAT, number), {} if answerer is None else {"answerer": answerer}
+        again = questions.repeated(state.past, number, options, left=left, rng=rng, answerer=answerer)
         if again is not None:
             shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
-            return _entry({"event": "asked", "query": number, **shown, "repeats": again.number})
+            return _entry({"event": "asked", "query": number, **shown, "repeats": again.number, **who})
         incumbent = state.opponents[newcomer] if state.opponents else state.preferences.undominated[-1]
         query = queries.show(number, newcomer, incumbent, state.compared, rng=self._rng(SHOW, number))
-        event = {"event": "asked", "query": number, "first": query.first, "second": query.second, "newcomer": newcomer}
+        shown = {"first": query.first, "second": query.second, "newcomer": newcomer}
+        event = {"event": "asked", "query": number, **shown, **who}
         if options.same_start:
-            event["rivals"] = rivals(query, state.trajectories, state.preferences)
+            beside = rivals(query, state.trajectories, state.preferences)
+            tied = beside if answerer is None else state.preferences.tied_with(incumbent)
+            event["rivals"] = [number for number in beside if number in tied]
         return _entry(event)
 
     def improve(self, state: LearnerState) -> Entry:
@@ -245,7 +274,7 @@ class Cycle:
                 discount=settings.trajectory_discount,
             ),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),
-            settings.estimation,
+            settings.estimation.after(settings.questions.left(known.answers)),
             settings.model,
             seed=int(self._rng(FIT, state.iteration).integers(2**31)),
         )

@@ -3,8 +3,8 @@
 Resuming a run, undoing an answer and reporting on a run in progress all use this fold. There are five events:
 
 * `collected`: new trajectories (step 3), and which of them to ask about, in order (step 4);
-* `asked`: a question, with the order in which the two trajectories were shown, and the number of the earlier question
-  that it `repeats`, if any;
+* `asked`: a question, with the order in which the two trajectories were shown, the number of the earlier question that
+  it `repeats`, if any, and the `answerer` who is asked, where several people answer at once;
 * `answered`: the expert's answer; `answerer`, the name of who gave it, and `seconds`, the time they took, where known;
 * `improved`: a new estimate and a new policy (steps 1 and 2), which end an iteration;
 * `undone`: the last answer and everything after it is taken back.
@@ -73,8 +73,8 @@ class LearnerState:
       information: what the answer about the first of them was expected to tell, nats; None where that is unknown.
       wanted: number of answers still wanted in this iteration.
       unasked: number of consecutive iterations, up to now, without a question.
-      query: the question that waits for an answer; None if none does.
-      rivals: the undominated trajectories that the newcomer of the question competes with; None: all.
+      open: the questions that wait for an answer, in the order in which they were asked; where one person answers, one
+        at most.
       queries: number of questions so far.
       past: the questions so far that were answered.
       shown: the trajectories that were shown in some question.
@@ -101,8 +101,7 @@ class LearnerState:
     information: float | None = None
     wanted: int = 0
     unasked: int = 0
-    query: Query | None = None
-    rivals: tuple[int, ...] | None = None
+    open: tuple[Query, ...] = ()
     queries: int = 0
     past: tuple[PastQuestion, ...] = ()
     shown: frozenset[int] = frozenset()
@@ -112,6 +111,11 @@ class LearnerState:
     def finished(self, settings: Settings) -> bool:
         """Whether a run with these settings ends here: after an iteration, not within one."""
         return not self.collected and settings.finished(self.iteration, self.preferences.answers, self.unasked)
+
+    @property
+    def query(self) -> Query | None:
+        """The question that has waited longest for an answer; None if none does."""
+        return self.open[0] if self.open else None
 
     @property
     def previous(self) -> "LearnerState | None":
@@ -266,15 +270,16 @@ def _asked(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         raise ValueError(f"asked: expected a question that was asked before with sides swapped, got {dict(event)}")
     compared = state.compared
     both = (compared[shown[0]], compared[shown[1]])
-    query = Query(event["query"], *shown, event["newcomer"], both, repeats)
-    rivals = event.get("rivals")
-    return replace(
-        state,
-        query=query,
-        queries=query.number,
-        shown=state.shown.union(shown),
-        rivals=None if rivals is None else tuple(rivals),
-    )
+    rivals, answerer = event.get("rivals"), event.get("answerer")
+    if answerer is not None:
+        checks.short_name("answerer", answerer)
+    if rivals is None and event["newcomer"] in shown and repeats is None:
+        incumbent = shown[shown[0] == event["newcomer"]]
+        newest = incumbent in state.preferences.undominated[-1:]
+        rivals = state.preferences.tied_with(incumbent) if newest else None
+    rivals = None if rivals is None else tuple(rivals)
+    query = Query(event["query"], *shown, event["newcomer"], both, repeats, rivals, answerer)
+    return replace(state, open=(*state.open, query), queries=query.number, shown=state.shown.union(shown))
 
 
 def answered(query: int, answer: Answer, *, answerer: str | None = None, seconds: float | None = None) -> Entry:
@@ -292,9 +297,10 @@ def answered(query: int, answer: Answer, *, answerer: str | None = None, seconds
 
 
 def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
-    query = state.query
-    if query is None or query.number != event["query"]:
-        raise ValueError(f"answered: expected an answer to {query}, got one to question {event['query']}")
+    query = next((waiting for waiting in state.open if waiting.number == event["query"]), None)
+    if query is None:
+        waiting = [waiting.number for waiting in state.open]
+        raise ValueError(f"answered: expected an answer to an open question of {waiting}, got one to {event['query']}")
     answer, answerer, seconds = parse_answer(event["answer"]), event.get("answerer"), event.get("seconds")
     if answerer is not None:
         checks.short_name("answerer", answerer)
@@ -305,7 +311,7 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         left = tuple(number for number in left if number != query.newcomer)
     shown = (query.number, query.first, query.second, query.newcomer, query.repeats)
     past = (*state.past, PastQuestion(*shown, answer, answerer, seconds))
-    after = replace(state, query=None, candidates=left, past=past)
+    after = replace(state, open=tuple(each for each in state.open if each is not query), candidates=left, past=past)
     after = replace(after, before=(*state.before[1 - MOST_UNDONE :], replace(state, before=())))
     if answer is Answer.SKIP:
         return after
@@ -317,11 +323,11 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         query.newcomer,
         query.incumbent,
         preferred=preferred,
-        rivals=state.rivals,
+        rivals=query.rivals,
         shown_first=query.first,
         answerer=answerer,
     )
-    return replace(after, preferences=preferences, wanted=state.wanted - 1)
+    return replace(after, preferences=preferences, wanted=max(0, state.wanted - 1))
 
 
 def plain(value: Any) -> Any:

@@ -170,7 +170,8 @@ class Learner:
     def ask(self) -> list[Query]:
         """The question that waits for an answer, after doing whatever comes before it; empty when finished.
 
-        Each new trajectory is compared with the best of all before it, so there is one question at a time.
+        Each new trajectory is compared with the best of all before it, so there is one question at a time. Where
+        several people answered at once, all questions that they left wait.
         """
         self._advance()
         return self._waiting()
@@ -197,6 +198,8 @@ class Learner:
         if isinstance(answers, str) or not isinstance(answers, Sequence) or len(answers) != len(waiting):
             raise ValueError(f"tell: expected a list of {len(waiting)} answers, one a question, got {answers!r}")
         parsed = [parse_answer(answer) for answer in answers]
+        if Answer.UNDO in parsed and len(parsed) > 1:
+            raise ValueError("tell: expected undo() where several questions wait, got an undo among their answers")
         numbers = [query.number for query in waiting]
         entries = [
             events.answered(number, answer, answerer=answerer, seconds=seconds)
@@ -263,7 +266,7 @@ class Learner:
         return ComparisonWidget(self, most_answers=answers, answerer=answerer)
 
     def _waiting(self) -> list[Query]:
-        return [] if self.state.query is None else [self.state.query]
+        return [] if self.finished else list(self.state.open)
 
     def _advance(self, progress: Callable[["Learner"], None] | None = None) -> None:
         """Do what can be done without an answer; `progress` is called after each iteration."""

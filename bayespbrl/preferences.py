@@ -41,6 +41,8 @@ class Query:
       trajectories: the two trajectories, in the order shown.
       repeats: number of the earlier question about the same two, which were then shown the other way round; None for a
         new question.
+      rivals: the undominated trajectories that the newcomer competes with; None: all.
+      answerer: who is asked, where several people answer at once; None: whoever answers.
     """
 
     number: int
@@ -49,6 +51,8 @@ class Query:
     newcomer: int
     trajectories: tuple[Trajectory, Trajectory]
     repeats: int | None = None
+    rivals: tuple[int, ...] | None = None
+    answerer: str | None = None
 
     @property
     def incumbent(self) -> int:
@@ -161,6 +165,9 @@ class Preferences:
         A better newcomer is preferred over every rival and replaces them. Over a worse one, every rival is preferred.
         In a tie (`preferred=None`) the newcomer joins them, and the pair is a tie.
 
+        Where several people answer at once, an incumbent may have become dominated since it was asked about. Then the
+        answer is about the two alone, and only a better newcomer becomes undominated.
+
         Args:
           rivals: the undominated trajectories that the newcomer is compared with, the incumbent among them unless it
             was never shown; None: all.
@@ -175,20 +182,34 @@ class Preferences:
             raise ValueError(f"incumbent: expected the newest undominated of {self.undominated}, got {incumbent}")
         if preferred not in (None, newcomer, incumbent):
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
-        beside = self.undominated if rivals is None else tuple(rivals)
+        beside = self.undominated if rivals is None else tuple(each for each in rivals if each in self.undominated)
+        fallen = incumbent not in beside and rivals is not None and incumbent in rivals
         if incumbent not in beside:
             beside = (*beside, incumbent)
         others = tuple(each for each in self.undominated if each not in beside)
         asked = (incumbent, newcomer) if preferred == incumbent else (newcomer, incumbent)
         new_pairs, ties, standing = tuple[tuple[int, int], ...](), self.ties, (*others, *beside)
+        if fallen:
+            standing = self.undominated
         if preferred is None:
-            ties, standing = (*ties, asked), (*standing, newcomer)
+            ties, standing = (*ties, asked), standing if fallen else (*standing, newcomer)
         elif preferred == newcomer:
             new_pairs, standing = tuple((newcomer, member) for member in beside), (*others, newcomer)
         else:
             new_pairs = tuple((member, newcomer) for member in beside)
         after = Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, self.sources)
         return after._with_sources(self, asked, shown_first, answerer)
+
+    def tied_with(self, trajectory: int) -> tuple[int, ...]:
+        """The undominated trajectories that tie with one of them, itself among them, in their order.
+
+        Those that no ties connect were never compared: several people answered at once.
+        """
+        together, before = {trajectory} & set(self.undominated), set[int]()
+        while together != before:
+            before = set(together)
+            together |= {each for tie in self.ties if together & set(tie) for each in tie if each in self.undominated}
+        return tuple(each for each in self.undominated if each in together)
 
     def add_repeated(
         self, first: int, second: int, *, preferred: int | None, answerer: str | None = None

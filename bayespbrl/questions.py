@@ -135,18 +135,26 @@ def later_questions(rule: QueryRule, situation: QuerySituation, options: Questio
 
 
 def repeated(
-    past: Sequence[PastQuestion], number: int, options: Questions, *, left: float, rng: np.random.Generator
+    past: Sequence[PastQuestion],
+    number: int,
+    options: Questions,
+    *,
+    left: float,
+    rng: np.random.Generator,
+    answerer: str | None = None,
 ) -> PastQuestion | None:
     """The earlier question that question `number` repeats; None where a new one is due.
 
     Args:
       past: the questions so far that were answered.
       left: answers of the budget that nothing else is wanted for.
-      rng: chooses among the last answerer's that have not been repeated, without the last few.
+      rng: chooses among one person's that have not been repeated, without the last few.
+      answerer: who is asked, since only who answered a question can be consistent; None: whoever answered last.
     """
     done = {question.repeats for question in past}
     if len(done - {None}) >= int(options.repeats * number + 1e-9) or left < 1:
         return None
     new = [each for each in past[:-LEAST_BETWEEN] if each.repeats is None and each.answer is not Answer.SKIP]
-    suitable = [each for each in new if each.number not in done and each.answerer == past[-1].answerer]
+    person = past[-1].answerer if past and answerer is None else answerer
+    suitable = [each for each in new if each.number not in done and each.answerer == person]
     return suitable[rng.integers(len(suitable))] if suitable else None

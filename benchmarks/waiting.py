@@ -17,7 +17,8 @@ from collections.abc import Callable
 import numpy as np
 
 import bayespbrl
-from bayespbrl.people.session import QUESTION, Session
+from bayespbrl.people.session import Session
+from bayespbrl.people.views import QUESTION
 from bayespbrl.preferences import Answer
 
 

@@ -46,14 +46,14 @@ def gridworld(tmp_path):
 
 
 @contextmanager
-def tab(browser, page, ready=READY, **options):
+def tab(browser, page, ready=READY, address=None, **options):
     """A tab of the browser in a context of its own, which shows a question, or what `ready` selects."""
     context = browser.new_context(**options)
     context.set_default_timeout(120_000)  # milliseconds; machines may be busy
     try:
         opened = context.new_page()
         opened.on("pageerror", lambda error: pytest.fail(f"JavaScript: {error}"))
-        opened.goto(page.address)
+        opened.goto(address or page.address)
         opened.wait_for_selector(ready)
         yield opened
     finally:
@@ -64,10 +64,10 @@ def turn_of(opened):
     return int(opened.get_attribute(".bp-box", "data-turn"))
 
 
-def next_turn(opened, turn):
-    """Wait for the question after a turn, or for the end."""
+def next_turn(opened, turn, other=".bp-box[data-phase=finished]"):
+    """Wait for the question after a turn, for the end, or for what else is selected."""
     shown = ".bp-box:is([data-phase=question], [data-phase=instructions])[data-locked=false]"
-    opened.wait_for_selector(f"{shown}:not([data-turn='{turn}']), .bp-box[data-phase=finished]")
+    opened.wait_for_selector(f"{shown}:not([data-turn='{turn}']), .bp-box[data-phase=finished], {other}")
 
 
 def until(opened, condition):

@@ -15,12 +15,15 @@ from toys import QUICK, Slope, fingerprint
 import bayespbrl
 from bayespbrl.cli.commands import main
 from bayespbrl.events import LearnerState
+from bayespbrl.models.likelihoods import Logistic
 from bayespbrl.people.clips import MOST_BYTES, Clips
 from bayespbrl.people.drawing import SCENES
 from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
-from bayespbrl.people.session import FINISHED, QUESTION, Session, Stale, answer_of
+from bayespbrl.people.seat import Stale
+from bayespbrl.people.session import Session, answer_of
+from bayespbrl.people.views import FINISHED, QUESTION, with_ties
 from bayespbrl.people.widget import ComparisonWidget
 from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.lock import continuing
@@ -56,14 +59,17 @@ def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitti
     session = sitting(bayespbrl.Learner("gridworld", **options), answerer="Ada")
     ahead = []
     while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
-        moment = session._foresight.present
-        with session._changed:  # until the thread has foreseen both likely answers
-            foreseen = session._changed.wait_for(
-                lambda now=moment: len(now.after) >= 2 and all(now.after[a].complete for a in now.likely[:2]), WAIT
+        moment, number = session._foresight.present, session.learner.state.query.number
+        with session.changed:  # until the thread has foreseen both likely answers
+            foreseen = session.changed.wait_for(
+                lambda now=moment, n=number: (
+                    len(now.after) >= 2 and all(now.after[n, a].complete for a in now.likely[n][:2])
+                ),
+                WAIT,
             )
         assert foreseen
         given = bayespbrl.ReturnExpert()(*session.learner.state.query.trajectories)
-        ahead.append(given in moment.after and moment.after[given].complete)
+        ahead.append((number, given) in moment.after and moment.after[number, given].complete)
         session.answer(view["turn"], str(given), 1.5)
     plain = bayespbrl.Learner("gridworld", **options).run(bayespbrl.ReturnExpert(), answerer="Ada")
     assert fingerprint(session.learner) == fingerprint(plain)
@@ -73,7 +79,7 @@ def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitti
 def test_a_tie_is_foreseen_last_until_the_run_has_one():
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
     answers = tuple(map(Answer, ("second", "first", "skip", "tie")))
-    foresight = Foresight(learner.cycle, learner.state, lambda state: ("shown", answers))
+    foresight = Foresight(learner.cycle, learner.state, lambda state, query: ("shown", answers))
 
     def foreseen(number):
         """The answers after which the next moments are foreseen."""
@@ -84,13 +90,30 @@ def test_a_tie_is_foreseen_last_until_the_run_has_one():
                 foresight.keep(moment, entry)
             if moment.complete:
                 after = foresight.present.after.items()
-                order.append(next((str(answer) for answer, known in after if known is moment), "other"))
+                order.append(next((str(answer) for (_, answer), known in after if known is moment), "other"))
         return order
 
     assert foreseen(9) == ["other", "second", "first", "skip", *["other"] * 4, "tie"]
-    present = foresight.move(Answer.TIE, foresight.present.after[Answer.TIE].state)
+    present = foresight.move(1, Answer.TIE, foresight.present.after[1, Answer.TIE].state)
     assert present.complete
     assert foreseen(4) == ["second", "first", "skip", "tie"]
+
+
+@pytest.mark.parametrize(
+    ("margin", "threshold", "order"),
+    [
+        (0.0, None, "second first skip tie"),
+        (0.1, 1.0, "tie first skip second"),
+        (-0.1, 1.0, "tie second skip first"),
+        (2.0, 1.0, "first tie skip second"),
+        (0.2, 0.01, "first second skip tie"),
+    ],
+)
+def test_a_tie_is_foreseen_as_early_as_it_is_likely_once_the_run_has_one(margin, threshold, order):
+    before = tuple(map(Answer, ("second", "first", "skip", "tie")))
+    thresholds = None if threshold is None else np.full((5, 1), threshold)
+    likely = with_ties(before, np.full((5, 1), margin), Logistic(4.0), thresholds)
+    assert " ".join(likely) == order
 
 
 def test_nothing_reaches_the_log_before_the_answer(sitting, tmp_path):
@@ -99,8 +122,8 @@ def test_nothing_reaches_the_log_before_the_answer(sitting, tmp_path):
     session.wait(timeout=WAIT)
     before = learner.log.log_file.read_bytes()
     moment = session._foresight.present
-    with session._changed:
-        assert session._changed.wait_for(lambda: len(moment.after) > 1, WAIT)
+    with session.changed:
+        assert session.changed.wait_for(lambda: len(moment.after) > 1, WAIT)
     assert learner.log.log_file.read_bytes() == before
 
 
@@ -179,7 +202,7 @@ def test_practice_questions_are_about_other_trajectories_where_there_are_enough(
     def asked(number, first, second):
         both = (trajectories[first], trajectories[second])
         state = LearnerState(
-            None, trajectories=tuple(trajectories[:number]), query=Query(1, first, second, second, both)
+            None, trajectories=tuple(trajectories[:number]), open=(Query(1, first, second, second, both),)
         )
         return [(query.first, query.second) for query in practice_queries(state)]
 
@@ -190,7 +213,7 @@ def test_practice_questions_are_about_other_trajectories_where_there_are_enough(
 
 
 def test_a_quiet_line_now_and_then_says_that_a_person_may_pause(sitting, monkeypatch):
-    monkeypatch.setattr("bayespbrl.people.session.BREAK", 2)
+    monkeypatch.setattr("bayespbrl.people.views.BREAK", 2)
     session, notices = sitting(bayespbrl.Learner("gridworld", expert="other", **QUICK)), []
     while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
         notices.append(view["notice"])

@@ -2,7 +2,7 @@
 
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -37,8 +37,11 @@ app = typer.Typer(
 )
 
 Answerer = Annotated[
-    str | None,
-    typer.Option(help="Name or pseudonym of the person who answers; it is kept with each answer and its time."),
+    list[str] | None,
+    typer.Option(
+        help="Name or pseudonym of the person who answers; it is kept with each answer and its time. Repeat the option "
+        "for several people who answer on a page at once: each gets an address, and a question of their own."
+    ),
 ]
 Practice = Annotated[
     bool,
@@ -114,13 +117,13 @@ def run(
     **options: Any,
 ) -> None:
     """Learn a task from preferences; the run is kept in a directory."""
-    _check_expert(options.get("expert"), answerer)
+    _check_expert(options.get("expert"), answerer or [])
     if not practice and options.get("expert") != "page":
         raise ValueError("practice: expected --no-practice with the expert page alone")
     directory = out or fresh_directory(env)
     learner = runs.start(env, directory, seed=seed, **options)
     with continuing(directory):
-        run_to_the_end(learner, directory, answerer=answerer, practice=practice)
+        run_to_the_end(learner, directory, answerers=answerer or [], practice=practice)
 
 
 @app.command()
@@ -134,8 +137,8 @@ def resume(
     with continuing(directory):
         learner = runs.resume(directory, import_package=import_package)
         if not learner.finished:
-            _check_expert(learner.settings.expert, answerer)
-            run_to_the_end(learner, directory, answerer=answerer)
+            _check_expert(learner.settings.expert, answerer or [])
+            run_to_the_end(learner, directory, answerers=answerer or [])
         elif not (directory / PICTURE).exists():  # interrupted before it was drawn, or run in Python
             show_run(learner, directory)
         else:
@@ -162,7 +165,7 @@ def ask(
             raise ValueError(
                 f"expert: expected a run that a person answers, got {expert}, a simulated one: {directory}"
             )
-        options: dict[str, Any] = {"answers": answers, "answerer": answerer, "practice": practice}
+        options: dict[str, Any] = {"answers": answers, "answerers": answerer or [], "practice": practice}
         ask_on_page(learner, directory, **options, host=host, port=port)
 
 
@@ -268,12 +271,16 @@ def main() -> None:
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _check_expert(name: str | None, answerer: str | None) -> None:
+def _check_expert(name: str | None, answerers: Sequence[str]) -> None:
     """Refuse an expert who cannot answer here, a name for a simulated one, and a page without its extra."""
-    if answerer is not None:
+    for answerer in answerers:
         checks.short_name("answerer", answerer)
         if name not in ("terminal", "page"):
             raise ValueError(f"answerer: expected a name with the expert page or terminal, got {answerer!r}")
+    if len(set(answerers)) < len(answerers) or (name == "terminal" and len(answerers) > 1):
+        raise ValueError(
+            f"answerer: expected one name for each person, and one person at the terminal, got {answerers}"
+        )
     if name == "other":
         raise ValueError("expert: expected return, page or terminal, got other; continue in Python with Learner.run")
     if name == "page":

@@ -1,5 +1,6 @@
 """What the command line shows: progress, tables and pictures of runs and studies, and questions to a person."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +21,18 @@ console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may conta
 PICTURE = "run.png"
 
 
-def run_to_the_end(learner: Learner, directory: Path, *, answerer: str | None = None, practice: bool = True) -> None:
+def run_to_the_end(learner: Learner, directory: Path, *, answerers: Sequence[str] = (), practice: bool = True) -> None:
     """Run a learner that keeps its events in `directory` to its end, with its progress, then `show_run`.
 
-    `answerer` is the name of the person who answers; `practice` as of `ask_on_page`.
+    `answerers` are the names of the people who answer, at most one at the terminal; `practice` as of `ask_on_page`.
     """
     if learner.settings.expert == "page":
-        return ask_on_page(learner, directory, answerer=answerer, practice=practice)
+        return ask_on_page(learner, directory, answerers=answerers, practice=practice)
     console.print(f"Run directory: {directory}")
     try:
         if learner.settings.expert == "terminal":
             person = _person(learner, directory)
-            learner.run(person, answerer=answerer, progress=lambda now: console.print(_state(now)))
+            learner.run(person, answerer=next(iter(answerers), None), progress=lambda now: console.print(_state(now)))
         else:
             _run_with_bar(learner)
     except KeyboardInterrupt:
@@ -45,7 +46,7 @@ def ask_on_page(
     directory: Path,
     *,
     answers: int | None = None,
-    answerer: str | None = None,
+    answerers: Sequence[str] = (),
     practice: bool = True,
     host: str = "127.0.0.1",
     port: int = 0,
@@ -55,7 +56,7 @@ def ask_on_page(
     Args:
       learner: keeps its events in `directory`.
       answers: most answers of this sitting.
-      answerer: the person's name, kept beside the answers.
+      answerers: the names of those who answer at once, each on a page of their own; kept beside the answers.
       practice: whether a person who has not answered in this run yet gets instructions and practice first.
       host, port: of the page; port 0 for a free one.
 
@@ -66,9 +67,11 @@ def ask_on_page(
     from bayespbrl.people.page import Page
     from bayespbrl.people.session import Session
 
-    session = Session(learner, most_answers=answers, answerer=answerer, practice=practice)
+    session = Session(learner, most_answers=answers, answerer=answerers or None, practice=practice)
     page = Page(session, host=host, port=port)
-    console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:\n{page.address}")
+    console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:")
+    for name, address in zip(answerers or [""], page.addresses, strict=True):
+        console.print(f"{name}: {address}" if len(answerers) > 1 else address)
     try:
         page.serve()
     except KeyboardInterrupt:

@@ -4,14 +4,14 @@ A learner's state never changes and each event follows from it alone, so what is
 computed late, bit for bit. Nothing reaches the log before the answer does.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from bayespbrl import events
 from bayespbrl.cycle import Cycle
 from bayespbrl.events import Entry, LearnerState
-from bayespbrl.preferences import Answer
+from bayespbrl.preferences import Answer, Query
 
 LIKELY = 2  # answers after which two answers are foreseen, each
 
@@ -22,26 +22,33 @@ class Moment:
 
     Attributes:
       state: what the learner knows.
+      holders: who looks at which open question, by its number.
       entries: the events since the answer.
-      settled: whether a question waits in `state`, or the run is finished.
-      shown: what a person is shown of the question; None until it is drawn.
-      likely: the answers to it, the likeliest first and a tie last; () until it is drawn.
-      after: what follows an answer.
+      settled: whether everybody has a question, or there is none for those without.
+      shown: what is shown of each question, by its number; none until it is drawn.
+      likely: the answers to each, the likeliest first.
+      after: what follows an answer to a question.
       failed: whether computing it raised; then it is computed again when the answer is there.
     """
 
     state: LearnerState
+    holders: Mapping[int, str | None] = field(default_factory=dict)
     entries: list[Entry] = field(default_factory=list)
     settled: bool = False
-    shown: Any = None
-    likely: tuple[Answer, ...] = ()
-    after: dict[Answer, "Moment"] = field(default_factory=dict)
+    shown: dict[int, Any] = field(default_factory=dict)
+    likely: dict[int, tuple[Answer, ...]] = field(default_factory=dict)
+    after: dict[tuple[int, Answer], "Moment"] = field(default_factory=dict)
     failed: bool = False
 
     @property
+    def unseen(self) -> Query | None:
+        """A question that somebody is to look at and that is not drawn yet; None where there is none."""
+        return next((q for q in self.state.open if q.number in self.holders and q.number not in self.shown), None)
+
+    @property
     def complete(self) -> bool:
-        """Whether a person can be shown what comes next."""
-        return self.settled and (self.state.query is None or self.shown is not None)
+        """Whether everybody can be shown what comes next."""
+        return self.settled and self.unseen is None
 
 
 class Foresight:
@@ -49,19 +56,25 @@ class Foresight:
 
     Args:
       cycle: of the learner.
-      show: what a person is shown in a state with a question, and the answers to it: the likeliest first, a tie last.
-      answerer: who is going to answer; None where that is not known.
+      show: what is shown of a question in a state, and the answers to it, the likeliest first.
+      people: who are here; (None,) is one person without a name. Each gets a question of their own.
+      several: whether there may be others than these.
+      most: answers of the run after which the sitting is over.
     """
 
     def __init__(
         self,
         cycle: Cycle,
         state: LearnerState,
-        show: Callable[[LearnerState], tuple[Any, tuple[Answer, ...]]],
-        answerer: str | None = None,
+        show: Callable[[LearnerState, Query], tuple[Any, tuple[Answer, ...]]],
+        people: Sequence[str | None] = (None,),
+        *,
+        several: bool = False,
+        most: int | None = None,
     ):
-        self.cycle, self.show, self.answerer = cycle, show, answerer
-        self.present = Moment(state)
+        self.cycle, self.show, self.several, self.most = cycle, show, several, most
+        self.people = tuple(people)
+        self.present = self._following(Moment(state), state, {})
 
     def pending(self) -> Moment | None:
         """The moment to compute a piece of next; None where there is nothing left to do."""
@@ -70,55 +83,97 @@ class Foresight:
         return next((moment for moment in self._ahead() if not (moment.complete or moment.failed)), None)
 
     def compute(self, moment: Moment) -> Entry | None:
-        """One piece of a moment: the event returned, or what is shown of its question (None). Changes nothing else."""
-        if moment.settled:
-            moment.shown, moment.likely = self.show(moment.state)
+        """One piece of a moment: the event returned, or what is shown of a question (None). Changes nothing else."""
+        if (query := moment.unseen) is not None:
+            moment.shown[query.number], moment.likely[query.number] = self.show(moment.state, query)
             return None
-        entry = self.cycle.next(moment.state)
+        entry = self._next(moment)
         if entry is None:
             moment.settled = True
         return entry
 
-    @staticmethod
-    def keep(moment: Moment, entry: Entry) -> None:
+    def _next(self, moment: Moment) -> Entry | None:
+        if not self.several:
+            return self.cycle.next(moment.state)
+        held = len(moment.holders)
+        free = [name for name in self.people if name not in moment.holders.values()]
+        if not free or (self.most is not None and 0 < held >= self.most - moment.state.preferences.answers):
+            return None
+        return self.cycle.next(moment.state, free[0], others=held)
+
+    def keep(self, moment: Moment, entry: Entry) -> None:
         """Add an event that `compute` returned."""
         moment.state = events.apply(moment.state, entry)
+        moment.holders = self._holders(moment.state, moment.holders)
         moment.entries.append(entry)
 
-    def move(self, answer: Answer, state: LearnerState) -> Moment:
+    def move(self, number: int, answer: Answer, state: LearnerState) -> Moment:
         """Go to the moment after an answer, with what is computed of it.
 
         Args:
-          answer: to the present question.
+          number: of the question that was answered.
           state: what the learner knows right after it.
         """
-        ahead = self.present.after.get(answer)
-        self.present = Moment(state) if ahead is None or ahead.failed else ahead
+        ahead = self.present.after.get((number, answer))
+        if ahead is None or ahead.failed:
+            ahead = self._following(self.present, state, self.present.holders)
+        self.present = ahead
+        return ahead
+
+    def back(self, number: int, state: LearnerState, person: str | None) -> Moment:
+        """Go to the state after an undo, in which this person looks at question `number` again."""
+        others = {held: who for held, who in self.present.holders.items() if who != person}
+        self.present = self._following(self.present, state, {**others, number: person})
         return self.present
 
-    def back(self, state: LearnerState) -> Moment:
-        """Go to the state after an undo."""
-        self.present = Moment(state, settled=True)
-        return self.present
+    def gather(self, people: Sequence[str | None]) -> None:
+        """From now on these people are here. The questions of others can be taken."""
+        if self.people != (now := tuple(people)):
+            self.people = now
+            if not self.present.failed:
+                self.present = self._following(self.present, self.present.state, self.present.holders)
+
+    def _following(self, moment: Moment, state: LearnerState, holders: Mapping[int, str | None]) -> Moment:
+        """A moment with that state, and with what is known of the questions of `moment` that are still open."""
+        still = self._holders(state, holders)
+        shown = {number: moment.shown[number] for number in still if number in moment.shown}
+        return Moment(state, still, shown=shown, likely={number: moment.likely[number] for number in shown})
+
+    def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
+        """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.
+
+        A repeated question is left to whoever answered the first one.
+        """
+        if state.finished(self.cycle.settings):
+            return {}
+        waiting = {query.number: query for query in state.open}
+        holders = {number: who for number, who in before.items() if number in waiting and who in self.people}
+        for query in sorted(state.open, key=lambda query: query.answerer not in self.people):
+            free = [name for name in self.people if name not in holders.values()]
+            if self.several and query.repeats is not None:
+                free = [past.answerer for past in state.past if past.number == query.repeats and past.answerer in free]
+            if free and query.number not in holders:
+                holders[query.number] = query.answerer if query.answerer in free else free[0]
+        return holders
 
     def _ahead(self) -> Iterator[Moment]:
         """The moments after each answer, and those after two likely ones.
 
-        A tie comes last where the run has none yet: an iteration follows it, which takes seconds.
+        The last answer is a tie where the run has none yet. It comes at the end then: seconds of compilation follow.
         """
-        following = list(self._after(self.present, len(Answer)))
-        soon = len(following) if self.present.state.preferences.ties else LIKELY + 1
+        following, questions = list(self._after(self.present, len(Answer))), len(self.present.holders)
+        soon = len(following) if self.present.state.preferences.ties else (LIKELY + 1) * questions
         yield from following[:soon]
-        for moment in following[:LIKELY]:
+        for moment in following[: LIKELY * questions]:
             yield from self._after(moment, LIKELY)
         yield from following[soon:]
 
     def _after(self, moment: Moment, most: int) -> Iterator[Moment]:
-        query = moment.state.query
-        if query is None or not moment.complete:
+        if not moment.complete:
             return
-        for answer in moment.likely[:most]:
-            if answer not in moment.after:
-                entry = events.answered(query.number, answer, answerer=self.answerer)
-                moment.after[answer] = Moment(events.apply(moment.state, entry))
-            yield moment.after[answer]
+        answers = ((n, who, answer) for n, who in moment.holders.items() for answer in moment.likely[n][:most])
+        for number, who, answer in sorted(answers, key=lambda each: moment.likely[each[0]].index(each[2])):
+            if (number, answer) not in moment.after:
+                state = events.apply(moment.state, events.answered(number, answer, answerer=who))
+                moment.after[number, answer] = self._following(moment, state, moment.holders)
+            yield moment.after[number, answer]

@@ -217,12 +217,13 @@ function render({ model, el }) {
     });
     find(".bp-learner").textContent = learnerText(view);
     if (view.turn === answered) return; // the answer is on its way
+    const known = box.dataset.turn === String(view.turn); // others have answered, or this turn's answer was refused
     lock(false);
     box.dataset.turn = view.turn;
     const which = view.practice ? `Practice ${view.practice.join(" of ")}: which one is better?` : "Which one is better?";
     const number = view.practice ? "" : `Question ${view.answered + 1}. `;
-    say(which, `${number}${which} ${view.notice} Left arrow: first. Right arrow: second.`);
-    focus();
+    say(which, known ? live.textContent : `${number}${which} ${view.notice} Left arrow: first. Right arrow: second.`);
+    if (!known) focus();
   }
 
   function instruct() {

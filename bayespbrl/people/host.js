@@ -6,7 +6,7 @@ const listeners = {};
 const fire = (event, message) => (listeners[event] ?? []).forEach((callback) => callback(message));
 const pause = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 const GONE = "The program behind this page has ended. Start it again and open the address that it prints.";
-const ELSEWHERE = "This question was answered in another window. That answer counts, and yours does not.";
+const ELSEWHERE = "This question was answered in another window, or by another person. That answer counts, and yours does not.";
 const PATIENCE = 20; // seconds without a server until the page stops trying
 
 const model = {

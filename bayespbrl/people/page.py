@@ -1,7 +1,8 @@
-"""The page: a small web server on one session, for a browser on this machine.
+"""The page: a small web server on one session, for browsers on this machine.
 
-The address holds a random token. Without it, from a foreign origin or under a foreign host name nothing is answered.
-The page loads nothing from elsewhere.
+Each person has an address of their own, which holds a random token. Without it, from a foreign origin or under a
+foreign host name nothing is answered, and nobody answers under the name of another. The page loads nothing from
+elsewhere.
 """
 
 import asyncio
@@ -11,7 +12,7 @@ import json
 import secrets
 import socket
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from importlib.resources import files
 
 import uvicorn
@@ -22,7 +23,8 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from bayespbrl.people.session import Session, Stale, answer_of
+from bayespbrl.people.seat import Seat, Stale
+from bayespbrl.people.session import Session, answer_of
 
 LARGEST_BODY = 4096  # bytes
 HEARTBEAT = 10.0  # seconds between signs of life
@@ -64,7 +66,9 @@ class Page:
     """
 
     def __init__(self, session: Session, *, host: str = "127.0.0.1", port: int = 0):
-        self.session, self.token = session, secrets.token_urlsafe(16)
+        self.session = session
+        self._seats = {secrets.token_urlsafe(16): seat for seat in session.seats}
+        self.token = next(iter(self._seats))  # of the first or only person
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, port), family=family)
@@ -78,10 +82,15 @@ class Page:
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """What the first or only person opens in a browser."""
+        return self.addresses[0]
+
+    @property
+    def addresses(self) -> list[str]:
+        """What each person opens in a browser."""
         host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
         host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self.port}/{self.token}/"
+        return [f"http://{host}:{self.port}/{token}/" for token in self._seats]
 
     def serve(self) -> None:
         """Answer requests until the session is over or `stop` is called; `KeyboardInterrupt` where the user stops it.
@@ -114,7 +123,7 @@ class Page:
             Route("/answer", self._answer, methods=["POST"]),
             *(Route(f"/{name}", self._file) for name in KINDS),
         ]
-        return Starlette(routes=routes, middleware=[Middleware(Guard, token=self.token, host=self.host)])
+        return Starlette(routes=routes, middleware=[Middleware(Guard, seats=self._seats, host=self.host)])
 
     async def _home(self, request: Request) -> Response:
         return Response(SHELL, media_type="text/html", headers=HEADERS)
@@ -127,7 +136,7 @@ class Page:
     async def _clip(self, request: Request) -> Response:
         turn, side = request.path_params["turn"], request.path_params["side"]
         try:
-            sheet = self.session.sheet(turn, side) if side in (0, 1) else None
+            sheet = seat_of(request).sheet(turn, side) if side in (0, 1) else None
         except Stale:
             sheet = None
         if sheet is None:
@@ -142,7 +151,7 @@ class Page:
             return PlainTextResponse(f"body: expected at most {LARGEST_BODY} bytes", 413)
         try:
             turn, answer, seconds = answer_of(json.loads(body))
-            await asyncio.to_thread(self.session.answer, turn, answer, seconds)
+            await asyncio.to_thread(seat_of(request).answer, turn, answer, seconds)
         except Stale as error:
             return PlainTextResponse(str(error), 409)
         except (ValueError, RecursionError) as error:
@@ -150,27 +159,34 @@ class Page:
         return Response(status_code=204)
 
     async def _events(self, request: Request) -> Response:
-        return StreamingResponse(self._views(), media_type="text/event-stream", headers=HEADERS)
+        return StreamingResponse(self._views(seat_of(request)), media_type="text/event-stream", headers=HEADERS)
 
-    async def _views(self) -> AsyncIterator[str]:
-        """Each view as a server-sent event, the present one first."""
+    async def _views(self, seat: Seat) -> AsyncIterator[str]:
+        """Each view of one person as a server-sent event, the present one first."""
         loop, changed = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
             with contextlib.suppress(RuntimeError):  # the server has just ended
                 loop.call_soon_threadsafe(changed.set)
 
-        deaf, sent = self.session.listen(wake), None
+        deaf, sent = seat.listen(wake), None
         try:
             while not self._server.should_exit:
                 changed.clear()
-                view = self.session.view
+                view = seat.view
                 yield ": here\n\n" if view is sent else f"data: {json.dumps(view)}\n\n"
                 sent = view
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(changed.wait(), HEARTBEAT)
         finally:
             deaf()
+
+
+def seat_of(request: Request) -> Seat:
+    """Whose address was asked."""
+    seat = request.scope["seat"]
+    assert isinstance(seat, Seat)
+    return seat
 
 
 async def _bounded(request: Request) -> bytes:
@@ -184,10 +200,10 @@ async def _bounded(request: Request) -> bytes:
 
 
 class Guard:
-    """Lets through what has the token as the first part of its path and comes from our own page."""
+    """Lets through what has a person's token as the first part of its path and comes from our own page."""
 
-    def __init__(self, app: ASGIApp, *, token: str, host: str):
-        self.app, self.token, self.host = app, token, host
+    def __init__(self, app: ASGIApp, *, seats: Mapping[str, Seat], host: str):
+        self.app, self.seats, self.host = app, seats, host
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -195,11 +211,12 @@ class Guard:
         _, _, rest = scope["path"].partition("/")
         token, slash, path = rest.partition("/")
         headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        if not (slash and secrets.compare_digest(token.encode(), self.token.encode()) and self._ours(headers)):
+        known = [seat for own, seat in self.seats.items() if secrets.compare_digest(token.encode(), own.encode())]
+        if not (slash and known and self._ours(headers)):
             refusal = PlainTextResponse("expected the address that the program printed, with its token", 403)
             await refusal(scope, receive, send)
             return
-        await self.app({**scope, "path": f"/{path}", "raw_path": f"/{path}".encode()}, receive, send)
+        await self.app({**scope, "path": f"/{path}", "raw_path": f"/{path}".encode(), "seat": known[0]}, receive, send)
 
     def _ours(self, headers: dict[str, str]) -> bool:
         """Whether host and origin are this machine's. A foreign name may have been bent to our address."""

@@ -12,12 +12,12 @@ AMONG = 12  # the first trajectories of the run, which follow its first policy
 
 
 def practice_queries(state: LearnerState) -> list[Query]:
-    """At most `QUESTIONS` pairs of the run's first trajectories, if possible none that the waiting question shows.
+    """At most `QUESTIONS` pairs of the run's first trajectories, if possible none that a waiting question shows.
 
     Neighbours come first: where a run compares by start, the first trajectories start alike in twos.
     """
-    compared, waiting = state.compared, state.query
-    shown = set() if waiting is None else {waiting.first, waiting.second}
+    compared = state.compared
+    shown = {number for waiting in state.open for number in (waiting.first, waiting.second)}
 
     def unsuitable(pair: tuple[int, int]) -> tuple[int, bool]:
         return len(shown & set(pair)), pair[0] % 2 == 1 or pair[1] > pair[0] + 1

@@ -1,62 +1,60 @@
 """One sitting: a learner, the person or people who answer, and a thread that thinks.
 
-A turn is one state of the run, and each turn takes one answer or one undo: question → answer → thinking → question. The
-answer is in the log, flushed, before `answer` returns. While a person looks, the thread computes what follows
-(`foresight`) and draws it. A person who is new to the run may first get instructions and practice (`practice`), whose
-turns record nothing.
+A turn is one state of the run as one person sees it, and takes one answer or one undo: question → answer → thinking →
+question. The answer is in the log, flushed, before `answer` returns. While people look, the thread computes what
+follows (`foresight`) and draws it. A person who is new to the run may first get instructions and practice (`practice`),
+whose turns record nothing.
+
+Several people answer at once, each a question of their own (`seat`). After an answer the run goes on while the others
+look at theirs, so that nobody waits for another; an answer may then be to a question of an earlier iteration.
 """
 
-import re
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
-from bayespbrl import checks, events, queries, questions
-from bayespbrl.envs.opening import environment_name
+from bayespbrl import checks, events
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.learner import Learner
-from bayespbrl.models.likelihoods import prob
-from bayespbrl.people.clips import Clip, Clips
+from bayespbrl.people import views
+from bayespbrl.people.clips import Clips
 from bayespbrl.people.foresight import Foresight, Moment
 from bayespbrl.people.practice import Introduction
-from bayespbrl.preferences import Answer, parse_answer
+from bayespbrl.people.seat import Seat, Stale
+from bayespbrl.people.views import (
+    FAILED,
+    FINISHED,
+    INSTRUCTIONS,
+    NOTHING_SAID,
+    QUESTION,
+    THINKING,
+    WAITING,
+    Shown,
+    View,
+)
+from bayespbrl.preferences import Answer, Query, parse_answer
 
-View = Mapping[str, Any]
-INSTRUCTIONS, THINKING, QUESTION, FINISHED, FAILED = "instructions", "thinking", "question", "finished", "failed"
-# An answer that is expected to tell less changes little: then the page says that a person may stop.
-LITTLE = questions.LEAST_INFORMATION / np.log(2)  # bits
-BREAK = 20  # answers of a sitting between two reminders that a person may pause
-
-
-class Stale(ValueError):
-    """An answer to a turn that is over, as from a second window."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """What a person is shown of a question: the clips, and what the learner says about it, as plain data."""
-
-    clips: tuple[Clip, Clip]
-    said: View
-
-
-NOTHING_SAID: View = {"worth": None, "sure": None, "advice": ""}
+GATHER = 1.0  # seconds between two looks at who is here, where there are several
 
 
 class Session:
     """A sitting over a learner, safe to call from any thread.
 
+    `view`, `sheet`, `listen`, `wait` and `answer` are those of the first or only person.
+
     Args:
       learner: it must not be used elsewhere while the session is open.
       most_answers: of this sitting, after which it is finished; None: as many as the run takes.
-      answerer: name of who answers, kept beside the answers. Only their own answers can be taken back.
-      practice: whether instructions and practice come first, unless that person has already answered in this run.
+      answerer: name of who answers, or names of several who answer at once; kept beside the answers. A person can take
+        back only an answer of their own. Of several, those are asked whose view somebody listens to.
+      practice: whether instructions and practice come first for those who have not answered in this run.
+
+    Attributes:
+      seats: one for each person.
+      changed: locked while anything changes.
 
     Raises:
-      ValueError: a finished run, a bad number or a bad name.
+      ValueError: a finished run, a bad number, a bad name or one twice.
     """
 
     def __init__(
@@ -64,116 +62,124 @@ class Session:
         learner: Learner,
         *,
         most_answers: int | None = None,
-        answerer: str | None = None,
+        answerer: str | Sequence[str] | None = None,
         practice: bool = False,
     ):
         if learner.finished:
             raise ValueError("learner: expected one with questions left, got a finished run")
         if most_answers is not None:
             checks.whole("answers", most_answers)
-        if answerer is not None:
-            checks.short_name("answerer", answerer)
-        self.learner, self.most_answers, self.answerer = learner, most_answers, answerer
-        new = all(past.answerer != answerer for past in learner.state.past)
-        self._introduction = Introduction() if practice and new else None
+        names = [answerer] if answerer is None or isinstance(answerer, str) else list(answerer)
+        for name in names:
+            if name is not None:
+                checks.short_name("answerer", name)
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"answerer: expected a name for each person, got {names}")
+        self.learner, self.most_answers = learner, most_answers
+        self.changed = threading.Condition(threading.RLock())
+        known = {past.answerer for past in learner.state.past}
+        self.seats = tuple(
+            Seat(self, name, turn, Introduction() if practice and name not in known else None)
+            for turn, name in enumerate(names, start=1)
+        )
+        self._turns, self._closing = len(names), False
+        self._before, self._past = learner.preferences.answers, len(learner.state.past)  # of earlier sittings
         self._clips = Clips(learner)
-        self._foresight = Foresight(learner.cycle, learner.state, self._show, answerer)
-        self._changed = threading.Condition(threading.RLock())
-        self._turn, self._closing = 1, False
-        self._before = learner.preferences.answers  # given in earlier sittings
-        self._listeners: list[Callable[[], None]] = []
-        self._view: View = self._described(THINKING)
-        self._sheets: tuple[int, tuple[Clip, Clip]] | None = None
+        most = None if most_answers is None else self._before + most_answers
+        self._foresight = Foresight(
+            learner.cycle, learner.state, self._show, self._here(), several=self._several, most=most
+        )
+        first = self.seats[0]
+        self.sheet, self.listen, self.wait, self.answer = first.sheet, first.listen, first.wait, first.answer
+        for seat in self.seats:
+            seat.view = self._described(seat, THINKING)
         self._thread = threading.Thread(target=self._think, name="bayespbrl-session", daemon=True)
 
     def open(self) -> "Session":
         """Start to think; returns the session."""
-        with self._changed:
+        with self.changed:
             self._settle()
         self._thread.start()
         return self
 
     def close(self) -> None:
         """Stop after the step of the cycle that is being computed. Nothing is lost."""
-        with self._changed:
+        with self.changed:
             self._closing = True
-            self._changed.notify_all()
+            self.changed.notify_all()
         if self._thread.is_alive():
             self._thread.join()
 
     @property
     def view(self) -> View:
-        """What a page or widget shows now, as plain data; never changed, only replaced."""
-        return self._view
+        """What the first or only person is shown."""
+        return self.seats[0].view
 
     @property
     def over(self) -> bool:
         """Whether the sitting is finished, or has failed."""
-        return self._view["phase"] in (FINISHED, FAILED)
+        return self.view["phase"] in (FINISHED, FAILED)
 
     @property
     def idle(self) -> bool:
-        """Whether a person is shown something and all that may follow is computed."""
-        with self._changed:
-            return self._view["phase"] != THINKING and self._pending() is None
+        """Whether everybody is shown something and all that may follow is computed."""
+        with self.changed:
+            return all(seat.view["phase"] != THINKING for seat in self.seats) and self._pending() is None
 
-    def sheet(self, turn: int, side: int) -> bytes:
-        """The sprite sheet of a clip of the question of a turn, side 0 or 1; `Stale` where the turn is over."""
-        sheets = self._sheets
-        if sheets is None or sheets[0] != turn:
-            raise Stale(f"turn: expected one with a question, got {turn}")
-        return sheets[1][side].sheet
+    @property
+    def _several(self) -> bool:
+        return len(self.seats) > 1
 
-    def listen(self, callback: Callable[[], None]) -> Callable[[], None]:
-        """Call `callback`, from any thread, whenever `view` is another; returns what ends that."""
-        self._listeners.append(callback)
-        return lambda: self._listeners.remove(callback)
+    def _here(self) -> list[str | None]:
+        return [seat.answerer for seat in self.seats if seat.here or not self._several]
 
-    def wait(self, phases: tuple[str, ...] = (QUESTION, FINISHED, FAILED), timeout: float | None = None) -> View:
-        """The view, once it is in one of `phases`."""
-        with self._changed:
-            if not self._changed.wait_for(lambda: self._view["phase"] in phases, timeout):
-                raise TimeoutError(f"expected {' or '.join(phases)}, still {self._view['phase']}")
-            return self._view
+    def gather(self) -> None:
+        """See who is here; the questions of those who left can be taken by others."""
+        if not self._several:
+            return
+        with self.changed:
+            before = self._foresight.present
+            if not self.over:
+                self._foresight.gather(self._here())
+            if self._foresight.present is not before:
+                self._settle()
 
-    def answer(self, turn: int, answer: str, seconds: float | None = None) -> None:
-        """Take the answer to the question of `turn`, or an undo there; it is on the disk when this returns.
-
-        The instructions are answered with "begin". What is answered to them and in practice is not kept.
-
-        Raises:
-          Stale: the turn is over, or its question is not there yet; nothing has happened.
-          ValueError: no answer, a bad time, or nothing to take back; nothing has happened.
-        """
-        with self._changed:
-            if turn != self._turn or self._view["phase"] not in (INSTRUCTIONS, QUESTION):
-                raise Stale(f"turn: expected {self._turn}, got {turn}")
-            if self._introducing is not None:
-                self._introducing.answer(answer)
-                self._turn += 1
+    def take(self, seat: Seat, turn: int, answer: str, seconds: float | None) -> None:
+        """What `Seat.answer` does."""
+        with self.changed:
+            if turn != seat.turn or seat.view["phase"] not in (INSTRUCTIONS, QUESTION):
+                raise Stale(f"turn: expected {seat.turn}, got {turn}")
+            if (introduction := self._introducing(seat)) is not None:
+                introduction.answer(answer)
+                self._turn(seat)
             elif answer == Answer.UNDO:
-                self._undo()
+                self._undo(seat)
             else:
-                self._take(answer, seconds)
+                self._take(seat, answer, seconds)
             self._settle()
 
-    def _undo(self) -> None:
-        if not self._view["undo"]:
-            raise ValueError("undo: expected an answer of the same person's to take back, got none")
-        self.learner.undo()
-        self._turn += 1
-        self._foresight.back(self.learner.state)
+    def _turn(self, seat: Seat) -> None:
+        """The next turn of one person."""
+        self._turns += 1
+        seat.turn, seat.number = self._turns, None
 
-    def _take(self, answer: str, seconds: float | None) -> None:
-        query = self.learner.state.query
-        assert query is not None
-        given = parse_answer(answer)
-        self.learner.record(events.answered(query.number, given, answerer=self.answerer, seconds=seconds))
-        self._turn += 1
-        moment = self._foresight.move(given, self.learner.state)
+    def _undo(self, seat: Seat) -> None:
+        if not seat.view["undo"]:
+            raise ValueError("undo: expected an answer of the same person's to take back, got none")
+        number = self.learner.state.past[-1].number
+        self.learner.undo()
+        self._turn(seat)
+        self._foresight.back(number, self.learner.state, seat.answerer)
+
+    def _take(self, seat: Seat, answer: str, seconds: float | None) -> None:
+        number, given = seat.number, parse_answer(answer)
+        assert number is not None
+        self.learner.record(events.answered(number, given, answerer=seat.answerer, seconds=seconds))
+        self._turn(seat)
+        moment = self._foresight.move(number, given, self.learner.state)
         try:
             if moment.complete:  # the next question can be looked at while its events are written
-                self._publish(moment)
+                self._settle()
             for entry in moment.entries:
                 self.learner.record(entry)
         except Exception as error:  # a full disk, or another learner in the run: this answer is kept all the same
@@ -183,17 +189,21 @@ class Session:
 
     def _think(self) -> None:
         while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._pending() is not None)
+            with self.changed:
+                pause = GATHER if self._several else None
+                self.changed.wait_for(lambda: self._closing or self._pending() is not None, pause)
+                self.gather()
                 moment = self._pending()
-            if self._closing or moment is None:
+            if self._closing:
                 return
+            if moment is None:
+                continue
             try:
                 entry = self._foresight.compute(moment)
-                with self._changed:
+                with self.changed:
                     self._keep(moment, entry)
             except Exception as error:  # the environment's, or a full disk
-                with self._changed:
+                with self.changed:
                     self._failed(moment, error)
 
     def _pending(self) -> Moment | None:
@@ -206,128 +216,90 @@ class Session:
             self._foresight.keep(moment, entry)
         if moment is self._foresight.present:
             self._settle()
-        self._changed.notify_all()
+        self.changed.notify_all()
 
     def _failed(self, moment: Moment, error: Exception) -> None:
         moment.failed = True
         if moment is self._foresight.present:
             reason = " ".join(str(error).split()) or type(error).__name__
-            self._set(self._described(FAILED) | {"say": f"Stopped: {reason} Your answers are kept."})
+            for seat in self.seats:
+                seat.set(self._described(seat, FAILED) | {"say": f"Stopped: {reason} Your answers are kept."})
 
     def _settle(self) -> None:
-        """Bring the view up to date with the present moment, and the thread to work."""
-        present = self._foresight.present
-        if present.failed:
+        """Bring the views up to date with the present moment, and the thread to work."""
+        if self._foresight.present.failed:
             return
-        if (introduction := self._introducing) is not None:
-            self._introduce(introduction)
-        elif present.complete:
-            self._publish(present)
-        else:
-            self._set(self._described(THINKING))
-        self._changed.notify_all()
+        for seat in self.seats:
+            self._publish(seat, self._foresight.present)
+        self.changed.notify_all()
 
     # What is shown.
 
-    def _show(self, state: LearnerState) -> tuple[Shown, tuple[Answer, ...]]:
-        """The clips of the question that waits, and the answers to it, the likeliest first and a tie last."""
-        query = state.query
-        assert query is not None
-        if self._introduction is not None and self._introduction.clips is None:
-            self._introduction.draw(self._clips, state)
-        clips = self._clips.of(query, state)
-        said = dict(NOTHING_SAID)
-        first = 0.5
-        if state.estimate is not None and state.estimate.posterior is not None:
-            draws = state.estimate.trajectory_draws(query.trajectories, number=queries.QUERY_DRAWS)
-            likelihood = state.estimate.likelihood(queries.QUERY_DRAWS)
-            first = float(prob(likelihood, draws[:, :1] - draws[:, 1:]).mean())
-            worth = queries.expected_information(draws[:, :1], draws[:, 1:], likelihood=likelihood)
-            said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
-            if said["worth"] < LITTLE:
-                said["advice"] = (
-                    f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
-                )
-        likely = (Answer.FIRST, Answer.SECOND) if first >= 0.5 else (Answer.SECOND, Answer.FIRST)
-        return Shown(clips, said), (*likely, Answer.SKIP, Answer.TIE)  # after a skip there is little to compute
+    def _show(self, state: LearnerState, query: Query) -> tuple[Shown, tuple[Answer, ...]]:
+        """What a person is shown of a question that waits, and the answers to it, the likeliest first."""
+        for seat in self.seats:
+            if seat.introduction is not None and seat.introduction.clips is None:
+                seat.introduction.draw(self._clips, state)
+        said, likely = views.said_of(query, state)
+        return Shown(self._clips.of(query, state), said), likely
 
-    def _described(self, phase: str, state: LearnerState | None = None) -> dict[str, Any]:
-        state, settings = state or self.learner.state, self.learner.settings
-        return {
-            "phase": phase,
-            "turn": self._turn,
-            "task": re.sub(r"^bayespbrl/|-v\d+$", "", environment_name(self.learner.environment)),
-            "answered": state.preferences.answers,
-            "budget": settings.questions.answers,
-            "iteration": state.iteration,
-            "undo": state.previous is not None and state.past[-1].answerer == self.answerer,
-            "answerer": self.answerer,
-            "practice": None,
-            "notice": "",
-            "say": "",
-        }
+    def _described(self, seat: Seat, phase: str, state: LearnerState | None = None) -> dict[str, Any]:
+        state = state or self.learner.state
+        view = views.described(self.learner, state, phase, turn=seat.turn, answerer=seat.answerer)
+        if view["undo"] and self._several:  # not where it takes a question away that another looks at
+            open_before = {query.number for query in state.before[-1].open}
+            others = {number for number, who in self._foresight.present.holders.items() if who != seat.answerer}
+            view["undo"] = others <= open_before
+        return view
 
-    @property
-    def _introducing(self) -> Introduction | None:
+    def _introducing(self, seat: Seat) -> Introduction | None:
         """What comes before the first question, while it lasts; None where there is none, or no question to come."""
-        introduction, present = self._introduction, self._foresight.present
-        if introduction is None or introduction.over or (present.complete and present.state.query is None):
+        introduction = seat.introduction
+        if introduction is None or introduction.over or self._done(self._foresight.present):
             return None
         return introduction
 
-    def _introduce(self, introduction: Introduction) -> None:
+    def _done(self, moment: Moment) -> bool:
+        """Whether nobody is asked after this moment."""
+        state, most = moment.state, self.most_answers
+        given = state.preferences.answers - self._before
+        return moment.complete and (state.finished(self.learner.settings) or (most is not None and given >= most))
+
+    def _publish(self, seat: Seat, moment: Moment) -> None:
+        state = moment.state
+        number = next((held for held, who in moment.holders.items() if who == seat.answerer), None)
+        if seat.number not in (None, number):
+            self._turn(seat)  # another has taken the question
+        if self._done(moment):
+            given = state.preferences.answers - self._before
+            seat.set(self._described(seat, FINISHED, state) | {"say": views.ending(self.learner, state, given)})
+        elif (introduction := self._introducing(seat)) is not None:
+            self._introduce(seat, introduction)
+        elif number in moment.shown and (moment.complete or self._several):
+            seat.number = number
+            mine = [past for past in state.past[self._past :] if past.answerer == seat.answerer]
+            given = sum(past.answer is not Answer.SKIP for past in mine)
+            notice = views.notice(given, practised=seat.introduction is not None)
+            self._ask(seat, self._described(seat, QUESTION, state) | {"notice": notice}, moment.shown[number])
+        elif moment.complete and self._several:
+            seat.set(self._described(seat, WAITING, state) | {"say": views.NOTHING_LEFT})
+        else:
+            seat.set(self._described(seat, THINKING))
+
+    def _introduce(self, seat: Seat, introduction: Introduction) -> None:
         if introduction.place == 0:
-            self._set(self._described(INSTRUCTIONS))
+            seat.set(self._described(seat, INSTRUCTIONS))
         elif introduction.clips is None:
-            self._set(self._described(THINKING))
+            seat.set(self._described(seat, THINKING))
         else:
             place, number = introduction.place, len(introduction.clips)
             notice = "This is practice: your answer is not kept."
-            view = self._described(QUESTION) | {"practice": (place, number), "notice": notice, "undo": True}
-            self._ask(view, Shown(introduction.clips[place - 1], NOTHING_SAID))
+            view = self._described(seat, QUESTION) | {"practice": (place, number), "notice": notice, "undo": True}
+            self._ask(seat, view, Shown(introduction.clips[place - 1], NOTHING_SAID))
 
-    def _publish(self, moment: Moment) -> None:
-        state = moment.state
-        given = state.preferences.answers - self._before
-        done = self.most_answers is not None and given >= self.most_answers
-        if state.query is None or done:
-            self._set(self._described(FINISHED, state) | {"say": self._ending(state)})
-            return
-        notice = ""
-        if given > 0 and given % BREAK == 0:
-            notice = f"You have given {given} answers. Pause when you like; nothing is lost."
-        elif not given and self._introduction is not None:
-            notice = "The practice is over. From now on your answers are kept."
-        self._ask(self._described(QUESTION, state) | {"notice": notice}, moment.shown)
-
-    def _ask(self, view: View, shown: Shown) -> None:
-        self._sheets = self._turn, shown.clips
-        clips = [clip.described() for clip in shown.clips]
-        self._set({**view, "clips": clips, "rate": self._clips.rate(shown.clips), **shown.said})
-
-    def _ending(self, state: LearnerState) -> str:
-        """Why there is no further question."""
-        answers, budget = state.preferences.answers, self.learner.settings.questions.answers
-        if state.query is not None:
-            return (
-                f"These were the {answers - self._before} answers of this sitting. Thank you! The run can go on later."
-            )
-        if budget is not None and answers >= budget:
-            return f"All {answers} answers are given, and the policy has caught up with them. Thank you!"
-        if state.iteration >= self.learner.settings.most_iterations:
-            return f"The run has done its {state.iteration} iterations, with {answers} answers. Thank you!"
-        return (
-            f"The learner can foresee your answers: none was worth {LITTLE:.2f} bit in the last {state.unasked} "
-            f"iterations. It stops after {answers} answers. Thank you!"
-        )
-
-    def _set(self, view: View) -> None:
-        if view == self._view:
-            return
-        self._view = view
-        self._changed.notify_all()
-        for callback in list(self._listeners):
-            callback()
+    def _ask(self, seat: Seat, view: View, shown: Shown) -> None:
+        seat.sheets = seat.turn, shown.clips
+        seat.set(views.with_question(view, shown, self._clips.rate(shown.clips)))
 
 
 def answer_of(message: Any) -> tuple[int, str, float | None]:

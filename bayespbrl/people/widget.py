@@ -10,7 +10,8 @@ import anywidget
 import traitlets
 
 from bayespbrl.learner import Learner
-from bayespbrl.people.session import QUESTION, Session, answer_of
+from bayespbrl.people.session import Session, answer_of
+from bayespbrl.people.views import QUESTION
 
 FOLDER = Path(__file__).parent
 

@@ -64,6 +64,13 @@ class PosteriorUtility:
             lapse_rate=lapse_rate,
         )
 
+    def tie_thresholds(self, number: int | None = None) -> Float[np.ndarray, "s 1"] | None:
+        """The tie threshold of each of S draws, as of `likelihood`; None where no answer was a tie."""
+        drawn = self.posterior.children["posterior"].dataset
+        if "tie_threshold" not in drawn:
+            return None
+        return np.asarray(drawn["tie_threshold"].values[:, :: self._apart(number)].reshape(-1, 1))
+
     def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
         """The utility of n states."""
         return self._drawn(self._of_states(states), None)[0]

@@ -115,7 +115,7 @@ def _applied(
     parts = {"trajectories": [None] * settings.rollouts.trajectories_per_iteration, "policy": None, "estimate": None}
     clips: list[tuple[int, int]] = []
     for event in log:
-        query, pairs = state.query, len(state.preferences.pairs)
+        asked, pairs = {query.number: query for query in state.open}, len(state.preferences.pairs)
         try:
             if event["event"] == "collected":
                 clips += events.clips_in(event)
@@ -123,7 +123,8 @@ def _applied(
         except (ValueError, TypeError) as error:
             damage.append(_damage(f"events.jsonl: {error}; what follows is left out"))
             break
-        if event["event"] == "answered" and query is not None:
+        if event["event"] == "answered":
+            query = asked[event["query"]]
             after = len(state.preferences.pairs)
             row = after - 1 if after > pairs else None  # the pair that was asked about is the last of its answer's
             answer = Answer(event["answer"])

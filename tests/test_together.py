@@ -1,0 +1,283 @@
+"""Several people answer one run at once: each a question of their own, under their own name."""
+
+import json
+import shutil
+from contextlib import closing
+
+import pytest
+from test_page import KEYS, answers_of, call, next_turn, served, tab, turn_of
+from toys import QUICK, fingerprint
+
+import bayespbrl
+from bayespbrl.cli.commands import main
+from bayespbrl.people.seat import Stale
+from bayespbrl.people.session import Session
+from bayespbrl.people.views import FAILED, FINISHED, QUESTION, WAITING
+from bayespbrl.preferences import Preferences
+
+WAIT = 120  # seconds at most
+SEEN = (QUESTION, WAITING, FINISHED, FAILED)
+NAMES = ["Ada", "Ben"]
+LONGER = QUICK | {"iterations": 5}
+
+
+@pytest.fixture
+def sitting(tmp_path):
+    """Opens a session of two people who are here, over a run on the disk; closes it."""
+    opened = []
+
+    def sit(learner=None, **options):
+        learner = learner or bayespbrl.start("gridworld", tmp_path / "run", expert="page", **LONGER)
+        session = Session(learner, answerer=NAMES, **options).open()
+        opened.append(session)
+        return session, *((seat, seat.listen(lambda: None)) for seat in session.seats)
+
+    yield sit
+    for session in opened:
+        session.close()
+
+
+def settled(session):
+    """Wait until everybody is shown something."""
+    with session.changed:
+        assert session.changed.wait_for(lambda: all(seat.view["phase"] in SEEN for seat in session.seats), WAIT)
+
+
+def query_of(seat):
+    return next(query for query in seat.session.learner.state.open if query.number == seat.number)
+
+
+def logged(learner, kind):
+    events = map(json.loads, learner.log.log_file.read_text().splitlines())
+    return [event for event in events if event["event"] == kind]
+
+
+def test_two_people_answer_a_whole_run_at_once_and_no_question_is_shown_to_both(sitting):
+    session, (ada, _), (ben, _) = sitting()
+    expert, seen, both = bayespbrl.ReturnExpert(), {"Ada": set(), "Ben": set()}, 0
+    slow = 0
+    while not session.over:
+        settled(session)
+        asked = [seat for seat in (ada, ben) if seat.view["phase"] == QUESTION]
+        both += len(asked) == 2
+        for seat in asked:
+            query = query_of(seat)
+            seen[seat.answerer].add((query.number, frozenset((query.first, query.second))))
+        for seat in asked[:1] if slow % 3 else asked[-1:]:  # now one, now the other is faster
+            seat.answer(seat.view["turn"], str(expert(*query_of(seat).trajectories)), 1.0)
+        slow += 1
+    learner = session.learner
+    assert (session.view["phase"], learner.state.iteration) == (FINISHED, 5)
+    assert both >= 4
+    assert not seen["Ada"] & seen["Ben"]
+    assert len({pair for _, pair in seen["Ada"] | seen["Ben"]}) == len(seen["Ada"] | seen["Ben"])
+    answered = logged(learner, "answered")
+    assert len(answered) == learner.preferences.answers >= 5
+    assert {(event["answerer"], event["query"]) for event in answered} <= {
+        (name, number) for name, numbers in seen.items() for number, _ in numbers
+    }
+    assert {event["answerer"] for event in answered} == set(NAMES)
+    assert {name for _, name in learner.preferences.answered_by} == set(NAMES)
+    assert fingerprint(bayespbrl.load(learner.log.path).learner) == fingerprint(learner)
+
+
+def test_an_answer_follows_as_if_nobody_else_were_there(sitting):
+    """The other one's open question holds nobody up, and changes nothing but the number of the next question."""
+    session, (ada, _), (ben, _) = sitting()
+    settled(session)
+    ben_at = ben.number
+    for _ in range(2):  # what the first iteration wants
+        settled(session)
+        ada.answer(ada.view["turn"], "first")
+    settled(session)
+    assert (session.learner.state.iteration, ben.number) == (1, ben_at)
+    ben.answer(ben.view["turn"], "second")  # to a question of the first iteration, in the second
+    settled(session)
+    assert session.learner.state.iteration == 2
+    assert session.learner.preferences.answers == 3
+
+
+def test_the_other_ones_question_cannot_be_answered(sitting):
+    session, (ada, _), (ben, _) = sitting()
+    settled(session)
+    before = session.learner.log.log_file.read_bytes()
+    with pytest.raises(Stale, match="turn: expected"):
+        ben.answer(ada.view["turn"], "first")
+    with pytest.raises(Stale, match="turn: expected one with a question"):
+        ben.sheet(ada.view["turn"], 0)
+    assert session.learner.log.log_file.read_bytes() == before
+    assert ada.number != ben.number
+
+
+def test_an_undo_takes_back_only_the_last_answer_and_no_question_that_another_looks_at(sitting):
+    session, (ada, _), (ben, _) = sitting()
+    settled(session)
+    first = ada.number
+    ada.answer(ada.view["turn"], "first")
+    settled(session)
+    assert (ada.view["undo"], ben.view["undo"]) == (True, False)
+    with pytest.raises(ValueError, match="undo: expected an answer of the same person's"):
+        ben.answer(ben.view["turn"], "undo")
+    ben_at = ben.number
+    ada.answer(ada.view["turn"], "undo")
+    settled(session)
+    assert (ada.number, ben.number, session.learner.preferences.answers) == (first, ben_at, 0)
+    ada.answer(ada.view["turn"], "second")
+    settled(session)
+    ben.answer(ben.view["turn"], "first")
+    settled(session)
+    assert (ada.view["undo"], ben.view["undo"]) == (False, True)
+    assert [event["answer"] for event in logged(session.learner, "answered")] == ["first", "second", "first"]
+
+
+def test_whoever_goes_away_holds_nobody_up_and_their_question_is_taken(sitting, monkeypatch):
+    monkeypatch.setattr("bayespbrl.people.seat.AWAY", 0.0)
+    session, (ada, leaves), (ben, _) = sitting()
+    settled(session)
+    left, turn = ada.number, ada.view["turn"]
+    leaves()
+    session.gather()
+    taken = []
+    while True:
+        settled(session)
+        if session.over:
+            break
+        taken.append(ben.number)
+        ben.answer(ben.view["turn"], "first", 1.0)
+    assert left in taken
+    assert {event["answerer"] for event in logged(session.learner, "answered")} == {"Ben"}
+    with pytest.raises(Stale):
+        ada.answer(turn, "first")
+
+
+def test_what_a_killed_program_leaves_is_asked_again_of_the_same_people(sitting, tmp_path):
+    session, (ada, _), (ben, _) = sitting()
+    for seat in (ada, ben, ada):
+        settled(session)
+        seat.answer(seat.view["turn"], "first", 1.0)
+    settled(session)
+    numbers = ada.number, ben.number
+    shutil.copytree(tmp_path / "run", tmp_path / "left")
+    learner = bayespbrl.resume(tmp_path / "left")
+    assert {query.number for query in learner.state.open} == set(numbers)
+    assert learner.preferences == session.learner.preferences
+    again, (ada, _), (ben, _) = sitting(learner)
+    settled(again)
+    assert (ada.number, ben.number) == numbers
+    again.close()
+    queries = learner.ask()  # one person can go on too
+    assert len(queries) == 2
+    with pytest.raises(ValueError, match="undo"):
+        learner.tell(["undo", "first"])
+    learner.tell(["first", "tie"])
+    assert learner.preferences.answers == 5
+
+
+def test_a_sitting_of_several_ends_after_its_answers_and_asks_for_no_more(sitting):
+    session, (ada, _), (ben, _) = sitting(most_answers=3)
+    for seat in (ada, ben):
+        settled(session)
+        seat.answer(seat.view["turn"], "first")
+    settled(session)
+    phases = [seat.view["phase"] for seat in (ada, ben)]
+    assert sorted(phases) == [QUESTION, WAITING]
+    last = (ada, ben)[phases.index(QUESTION)]
+    last.answer(last.view["turn"], "first")
+    settled(session)
+    assert {seat.view["phase"] for seat in (ada, ben)} == {FINISHED}
+    assert session.learner.preferences.answers == 3
+
+
+def test_a_question_is_repeated_to_the_person_who_answered_it(sitting):
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK | {"iterations": 8, "repeats": 0.3})
+    session, (ada, _), (ben, _) = sitting(learner)
+    turns = 0
+    while True:
+        settled(session)
+        if session.over:
+            break
+        seat = [seat for seat in (ada, ben) if seat.view["phase"] == QUESTION][:: (-1) ** turns][0]
+        seat.answer(seat.view["turn"], "first")
+        turns += 1
+    past = {question.number: question for question in learner.state.past}
+    again = [question for question in past.values() if question.repeats is not None]
+    assert again
+    assert all(question.answerer == past[question.repeats].answerer for question in again)
+
+
+@pytest.mark.parametrize("names", [["Ada", "Ada"], ["Ada", ""], []])
+def test_bad_names_are_refused(names):
+    with pytest.raises(ValueError, match="answerer: expected"):
+        Session(bayespbrl.Learner("gridworld", expert="other", **QUICK), answerer=names)
+
+
+def test_the_command_line_refuses_a_name_twice_and_two_at_the_terminal(monkeypatch, capsys, tmp_path):
+    for options in (["page", "--answerer", "Ada"], ["terminal", "--answerer", "Ben"]):
+        arguments = ["run", "gridworld", "--answerer", "Ada", "--expert", *options, "--out", str(tmp_path / "new")]
+        monkeypatch.setattr("sys.argv", ["bayespbrl", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        assert (stop.value.code, capsys.readouterr().err.count("\n")) == (2, 1)
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_answer_about_an_incumbent_that_has_fallen_is_about_the_two_alone():
+    before = Preferences(undominated=(0,)).add(1, 0, preferred=1)  # meanwhile another was asked about 2 and 0
+    assert before.add(2, 0, preferred=2, rivals=[0]).undominated == (1, 2)
+    worse, tie = before.add(2, 0, preferred=0, rivals=[0]), before.add(2, 0, preferred=None, rivals=[0])
+    assert (worse.pairs, worse.undominated) == (((1, 0), (0, 2)), (1,))
+    assert (tie.ties, tie.undominated) == (((2, 0),), (1,))
+
+
+def test_only_those_that_ties_connect_compete_with_a_newcomer():
+    standing = Preferences(undominated=(0, 1, 2, 3), ties=((1, 0), (3, 1), (5, 2)))
+    assert standing.tied_with(3) == (0, 1, 3)
+    assert standing.tied_with(2) == (2,)
+
+
+@pytest.mark.slow
+def test_two_people_in_two_browsers_answer_a_run_and_cannot_answer_for_each_other(browser, tmp_path):
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **LONGER)
+    with served(learner, answerer=NAMES) as page:
+        home = page.addresses
+        tokens = [address.rstrip("/").rpartition("/")[2] for address in home]
+        assert len(set(tokens)) == 2
+        with (
+            closing(_Tab(browser, page, home[0])) as ada,
+            closing(_Tab(browser, page, home[1])) as ben,
+        ):
+            assert "answered by Ada" in ada.opened.inner_text(".bp-task")
+            assert "answered by Ben" in ben.opened.inner_text(".bp-task")
+            settled(page.session)
+            before = learner.log.log_file.read_bytes()
+            body = json.dumps({"turn": turn_of(ada.opened), "answer": "first"})
+            assert call(page, "POST", f"/{tokens[1]}/answer", body)[0] == 409
+            assert call(page, "GET", f"/{tokens[1]}/clip/{turn_of(ada.opened)}/0")[0] == 404
+            assert learner.log.log_file.read_bytes() == before
+            turns, given = [], 0
+            people = [ada, ben]
+            while "finished" not in (phases := [person.phase for person in people]):
+                person = people[given % 2] if phases[given % 2] == "question" else people[1 - given % 2]
+                turns.append(turn_of(person.opened))
+                person.opened.keyboard.press(KEYS[("first", "second")[given % 2]])
+                next_turn(person.opened, turns[-1], ".bp-box[data-phase=waiting]")
+                given += 1
+            assert len(set(turns)) == len(turns)
+    answered = logged(learner, "answered")
+    assert len(answers_of(page)) == given
+    assert {event["answerer"] for event in answered} == set(NAMES)
+
+
+class _Tab:
+    """A tab on one person's address."""
+
+    def __init__(self, browser, page, address):
+        self._context = tab(browser, page, address=address)
+        self.opened = self._context.__enter__()
+
+    @property
+    def phase(self):
+        return self.opened.get_attribute(".bp-box", "data-phase")
+
+    def close(self):
+        self._context.__exit__(None, None, None)
