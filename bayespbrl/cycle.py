@@ -274,7 +274,7 @@ class Cycle:
                 discount=settings.trajectory_discount,
             ),
             self.feature_source.of_states(state.trajectories, settings.features.of_utility, rng=rng),
-            settings.estimation.after(settings.questions.left(known.answers)),
+            settings.estimation,
             settings.model,
             seed=int(self._rng(FIT, state.iteration).integers(2**31)),
         )

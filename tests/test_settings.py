@@ -53,7 +53,6 @@ BAD = {
     "clip_steps": [0, 1.5, "all"],
     "worthwhile": [None, 1, "yes"],
     "plain_draws": [0, 15, 200.0, True],
-    "most_draws": [None, 249, 500.0, True],
     "repeats": [None, 1, -0.1, "all"],
     "checked": [None, 1, "yes"],
     "check_episodes": [None, 1, 2.5, True],
@@ -186,9 +185,3 @@ def test_each_option_is_read_by_one_part_and_every_part_keeps_its_own_defaults()
     assert settings == given
     assert settings.own_parts == ()
     assert settings_for("any", schedule="other", expert="other").own_parts == ("expert", "schedule")
-
-
-def test_the_cap_on_draws_that_people_wait_for_ends_with_the_budget_of_answers():
-    estimation = settings_for("CartPole-v1", expert="page", max_steps=20).estimation
-    assert [estimation.after(left).most_draws for left in (20, 1, 0)] == [500, 500, 8000]
-    assert settings_for("CartPole-v1", max_steps=20).estimation.most_draws == 8000

@@ -116,7 +116,6 @@ PEOPLE: dict[str, Any] = {
     "repeats": 0.1,  # a simulated expert would only repeat itself
     "unasked_iterations": 0,  # a person waits for them
     "evaluation_episodes": 20,  # and for these
-    "most_draws": 500,  # and for these, up to 4000 where answers are ties; 500 know each margin to 7 % of its deviation
     "worthwhile": False,  # the page says what an answer is worth, and leaves it to the person to stop
 }
 

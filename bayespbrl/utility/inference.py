@@ -1,7 +1,7 @@
 """Step 1, preference-based inverse reinforcement learning: from answers to an estimate of the utility (eqs. 5-10)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +10,6 @@ from xarray import DataTree
 from bayespbrl import checks
 from bayespbrl.features import StateFeatures
 from bayespbrl.models import Answers, PreferenceModel, linear_program, plain_chain, plain_draws, posterior_draws
-from bayespbrl.models.posterior import SamplerOptions
 from bayespbrl.models.posterior_tree import bases_of
 from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
@@ -36,30 +35,22 @@ class Estimation:
         critic's, as in the paper.
       plain_draws: moves of the paper's sampler, one chain without a check of convergence (`models.plain_chain`), which
         leaves ties out; None: chains until they converge.
-      most_draws: cap on the draws of each chain that has to converge, while there are answers to come; then it is that
-        of `sample_posterior`, since nobody waits.
     """
 
     utility: str = "posterior-mean"
     hyperparameters: str = "inferred"
     trajectory_discount: float | None = 1.0
     plain_draws: int | None = None
-    most_draws: int = SamplerOptions.max_samples
 
     def __post_init__(self) -> None:
         checks.one_of("utility", self.utility, METHODS)
         checks.one_of("hyperparameters", self.hyperparameters, ("inferred", "given"))
         if self.trajectory_discount is not None:
             checks.share("trajectory_discount", self.trajectory_discount)
-        checks.whole("most_draws", self.most_draws, SamplerOptions.num_samples)
         if self.plain_draws is not None:
             checks.whole("plain_draws", self.plain_draws, plain_chain.LEAST)
             if self.hyperparameters != "given":
                 raise ValueError(f"hyperparameters: expected given with plain_draws, got {self.hyperparameters!r}")
-
-    def after(self, left: float) -> "Estimation":
-        """The same where so many answers are to come."""
-        return self if left else replace(self, most_draws=max(self.most_draws, SamplerOptions.max_samples))
 
 
 def estimate(
@@ -86,8 +77,8 @@ def estimate(
     rng = np.random.default_rng([seed, 2])
     multiples = settings(features, inferred=options.hyperparameters == "inferred", rng=rng)
     sums = sums_under(features, multiples, comparisons.trajectories, discount=comparisons.discount)
-    method, plain, most = options.utility, options.plain_draws, options.most_draws
-    return _by_posterior(sums, multiples, comparisons, features, method, model, seed, plain, most)
+    method, plain = options.utility, options.plain_draws
+    return _by_posterior(sums, multiples, comparisons, features, method, model, seed, plain)
 
 
 def infer_utility(
@@ -160,7 +151,6 @@ def _by_posterior(
     model: PreferenceModel,
     seed: int,
     plain: int | None = None,
-    most: int = SamplerOptions.max_samples,
 ) -> PosteriorUtility:
     """Eqs. 7-8, from ψ of the trajectories under each setting, (n, D)."""
     for each in feature_sums:
@@ -168,8 +158,7 @@ def _by_posterior(
     scaled = [normalised(comparisons.differences(each)) for each in feature_sums]
     differences, scales = np.array([each for each, _ in scaled]), np.array([scale for _, scale in scaled])
     if plain is None:
-        sampler = SamplerOptions(max_samples=most)
-        tree = posterior_draws(differences, model, seed=seed, answers=comparisons.answers, sampler=sampler)
+        tree = posterior_draws(differences, model, seed=seed, answers=comparisons.answers)
     else:
         ordered = comparisons.ordered  # a row of zeros has no say
         known = np.where(ordered[:, None], differences, 0.0)
