@@ -52,6 +52,10 @@ def pytest_runtest_setup():
     calls.clear()
 
 
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.get_closest_marker("empties_caches") is not None)
+
+
 # What the modules with checked shapes import. Imported first, else it would be compiled from its source: while it loads
 # such a module, the hook looks for the compiled form of every other one under a name of its own.
 LIBRARIES = ["arviz_stats", "cmaes", "gymnasium", "jax", "matplotlib", "numpyro.infer", "xarray"]

@@ -90,6 +90,7 @@ def test_the_opposite_question_has_the_opposite_answer(settings):
     assert abs(forth[0, 0] - forth[0, 1]) > 0.1
 
 
+@pytest.mark.slow
 def test_each_draw_predicts_by_its_own_setting_steepness_and_lapse_rate():
     tree = sample_posterior(
         np.array([KNOWN, 3.0 * KNOWN[:, ::-1]]), steepness=None, lapse_rate=None, likelihood="logistic", **SAMPLING

@@ -81,7 +81,7 @@ def linear(tmp_path_factory):
     return run_of("Pendulum-v1", tmp_path_factory.mktemp("runs") / "linear", policy="linear-gaussian")
 
 
-@pytest.mark.parametrize("task", ["pendulum", "cartpole", "linear"])
+@pytest.mark.parametrize("task", ["pendulum", "cartpole", pytest.param("linear", marks=pytest.mark.slow)])
 def test_predict_takes_one_observation_or_many(request, task):
     run = request.getfixturevalue(task)
     env = gymnasium.make(run.settings.env)
