@@ -150,6 +150,7 @@ def test_a_run_of_an_earlier_version_which_tried_no_policy_goes_on(run, tmp_path
     assert learner.policy is not learner.state.best_policy
 
 
+@pytest.mark.slow
 def test_a_step_back_goes_on_from_the_kept_policy_with_less_trust():
     """An estimate that calls the newest trajectories worse sends the next update back to the best policy."""
     learner = Learner(Slope(), answers=3, **FAST)

@@ -179,6 +179,7 @@ def test_the_side_bias_has_its_whole_prior_where_the_features_explain_the_answer
     assert bias.std() == pytest.approx(priors.SIDE_BIAS_SCALE, rel=0.1)
 
 
+@pytest.mark.slow
 def test_names_are_kept_by_number_also_of_whom_no_answer_is_left():
     rows, sides = SETTINGS[0], np.array([1, -1, 1, 1])
     answers = Answers(None, sides, ["Bob", "Ada", "Ada", "Bob"]).checked(4)

@@ -59,6 +59,7 @@ def test_a_discrete_task_of_ours_earns_utility_too(gridworld_run):
     assert reward == pytest.approx(run.estimate.utilities(np.array([observation]))[0])
 
 
+@pytest.mark.slow
 def test_other_spaces_and_runs_without_an_estimate_are_refused(pendulum, tmp_path):
     with pytest.raises(ValueError, match=r"^observation_space: expected Box.*, the run's, got Box"):
         UtilityReward(gymnasium.make("CartPole-v1"), pendulum)
