@@ -191,7 +191,9 @@ def test_a_stopped_run_of_the_default_goes_on_bit_for_bit(tmp_path):
     assert again.state.trust == whole.state.trust
 
 
-@pytest.mark.parametrize("env", ["swing-up", "Pendulum-v1", "CartPole-v1", "acrobot"])
+@pytest.mark.parametrize(
+    "env", ["swing-up", "Pendulum-v1", "CartPole-v1", pytest.param("acrobot", marks=pytest.mark.slow)]
+)
 def test_equal_starts_give_equal_first_states_and_other_actions(env):
     environment = rollouts.open_environment(env)
     policy = Learner(env, seed=1).last_policy

@@ -309,6 +309,7 @@ def test_simulation_based_calibration_of_the_margins(number, dimension, scale, s
     assert stats.chisquare(counts, 120 * np.diff(np.ceil(np.linspace(-0.5, 100.5, 6))) / 101).pvalue > 1e-3
 
 
+@pytest.mark.slow
 def test_the_posterior_finds_the_length_scale_that_ordered_the_pairs():
     rng = np.random.default_rng(1)
     points, centres = rng.uniform(-3, 3, (120, 1)), np.linspace(-3, 3, 60)
