@@ -1,6 +1,7 @@
 """What the test files share: shapes checked at run time, one thread a process, and finished runs of each kind."""
 
 import functools
+import importlib
 import os
 import shutil
 from collections import Counter
@@ -51,7 +52,21 @@ def pytest_runtest_setup():
     calls.clear()
 
 
-jaxtyping.install_import_hook(CHECKED, "conftest.check_shapes")
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.get_closest_marker("empties_caches") is not None)
+
+
+# What the modules with checked shapes import. Imported first, else it would be compiled from its source: while it loads
+# such a module, the hook looks for the compiled form of every other one under a name of its own.
+LIBRARIES = ["arviz_stats", "cmaes", "gymnasium", "jax", "matplotlib", "numpyro.infer", "xarray"]
+
+
+def pytest_sessionstart(session):
+    if session.config.getoption("dist", "no") == "no":  # not where tests are only handed out to other processes
+        for name in LIBRARIES:
+            importlib.import_module(name)
+        jaxtyping.install_import_hook(CHECKED, "conftest.check_shapes")
+
 
 # Test processes run side by side. With one thread each, the linear algebra of one does not wait for that of another.
 threadpool_limits(1)  # here, where NumPy has its threads already
@@ -60,8 +75,10 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
 os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
 os.environ["PYTHONWARNINGS"] = "ignore:Error reading persistent compilation cache entry"
-
-import bayespbrl
+# Compilation is most of the work of a first session: the older of two generators of code takes half as long.
+COMPILER = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+if COMPILER not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {COMPILER}".strip()
 
 QUICK = {"preset": "paper", "max_steps": 20, "evaluation_episodes": 3}
 
@@ -69,6 +86,8 @@ QUICK = {"preset": "paper", "max_steps": 20, "evaluation_episodes": 3}
 @pytest.fixture(scope="session")
 def gridworld_run(tmp_path_factory):
     """Directory of a finished Gridworld run, posterior mean, second answer wrong, third a tie; not to be changed."""
+    import bayespbrl
+
     directory = tmp_path_factory.mktemp("runs") / "gridworld"
     right, wrong = bayespbrl.ReturnExpert(), bayespbrl.NoisyExpert(bayespbrl.ReturnExpert(), wrong_answers=1.0, seed=0)
     answers = iter([right, wrong, lambda first, second: "tie", right])
@@ -86,6 +105,8 @@ def gridworld_copy(gridworld_run, tmp_path):
 @pytest.fixture(scope="session")
 def swing_up_learner(tmp_path_factory):
     """A finished swing-up run with all options of uncertainty: its directory and its learner; not to be changed."""
+    import bayespbrl
+
     directory = tmp_path_factory.mktemp("runs") / "swing-up"
     uncertainty = {"schedule": "confidence", "query": "information-when-unsure", "hyperparameters": "inferred"}
     options = {"updates_per_iteration": 2, "unasked_iterations": 1, "iterations": 4, "centres": 30, "seed": 3}

@@ -274,6 +274,7 @@ def test_lapse_rates_and_biases_are_each_persons_own():
     assert table["lapse_rate"][1] > table["lapse_rate"][0]  # Bob contradicts the others
 
 
+@pytest.mark.slow
 def test_who_answered_after_the_last_fit_has_no_lapse_rate_yet():
     tree = sample_posterior(np.array([[1.0], [0.8]]), lapse_rate=None, num_samples=100)  # Ada's answers alone
     table = people(PAST, tree)
@@ -290,13 +291,14 @@ def answered_by_two(tmp_path_factory) -> Path:
     turn = 0
     while questions := run.ask():
         turn += 1
-        if turn > 10:
+        if turn > 7:  # before the first fit: one program samples all posteriors
             run.tell(["first"], answerer="Bob", seconds=0.2)
         else:
             run.tell([ReturnExpert()(*questions[0].trajectories)], answerer="Ada", seconds=5.0)
     return directory
 
 
+@pytest.mark.slow
 def test_the_report_of_a_run_of_people_says_what_to_do_about_each(answered_by_two, monkeypatch):
     monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")  # the text alone is read
     text = write_report(answered_by_two, format="md").read_text()
@@ -318,6 +320,7 @@ def test_a_run_of_the_simulated_expert_has_no_section_on_people(tmp_path, monkey
     assert "## People" not in write_report(tmp_path / "run", format="md").read_text()
 
 
+@pytest.mark.slow
 def test_a_lapse_rate_that_was_set_has_no_interval_in_the_report(tmp_path, monkeypatch):
     monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")
     run = start("gridworld", tmp_path / "run", **(OPTIONS | {"utility": "posterior-mean", "iterations": 1}))
@@ -326,6 +329,7 @@ def test_a_lapse_rate_that_was_set_has_no_interval_in_the_report(tmp_path, monke
     assert "| 0 (set) | – | – |" in text  # a simulated expert favours no side
 
 
+@pytest.mark.slow
 def test_the_utility_without_one_person_is_that_of_the_others(answered_by_two):
     run = load(answered_by_two)
     assert run.preferences.answerers == ("Ada", "Bob")
@@ -340,6 +344,7 @@ def test_the_utility_without_one_person_is_that_of_the_others(answered_by_two):
         run.estimate_without("Eve")
 
 
+@pytest.mark.slow
 def test_the_answers_of_a_run_as_a_table_and_back(answered_by_two):
     run = load(answered_by_two)
     file = run.write_answers()
@@ -361,11 +366,16 @@ def test_answers_collected_elsewhere_by_hand(tmp_path):
     assert read.ties == ((4, 5),)
     assert read.shown_first.tolist() == [1, -1, -1, -1, 1, 1]
     assert read.answerers == ("Ada", "Ada", "Ada", "Ada", "Bob", "Bob")
-    utility = infer_utility(np.random.default_rng(0).normal(size=(6, 2)), **read._asdict())
-    assert set(utility.posterior["posterior"]["answerer"].values) == {"Ada", "Bob"}
     (tmp_path / "plain.csv").write_text("answer,second,first\nsecond,0,1\nskip,2,1\n")
     assert read_answers(tmp_path / "plain.csv")[:2] == (((0, 1),), ())
     assert read_answers(tmp_path / "plain.csv").answerers is None
+
+
+@pytest.mark.slow
+def test_a_utility_is_inferred_from_answers_collected_elsewhere(tmp_path):
+    read = read_answers(write_answers(tmp_path / "answers.csv", PAST))
+    utility = infer_utility(np.random.default_rng(0).normal(size=(6, 2)), **read._asdict())
+    assert set(utility.posterior["posterior"]["answerer"].values) == {"Ada", "Bob"}
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,12 @@
 import ast
 from pathlib import Path
 
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+
 import bayespbrl
+from bayespbrl import kernels
 
 ROOT = Path(bayespbrl.__file__).parent
 MODULES = {
@@ -197,3 +202,8 @@ def test_functions_are_short_and_take_few_parameters():
         if number > MOST_PARAMETERS and not node.name.startswith("_") and not door:
             wide.append(f"{module}.{node.name}: {number} parameters")
     assert (long, wide) == ([], [])
+
+
+def test_arrays_are_checked_against_their_annotations_while_the_tests_run():
+    with pytest.raises(TypeCheckError):
+        kernels.inverse_bandwidths(np.ones(2, dtype=int), np.ones(2))

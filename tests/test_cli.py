@@ -109,6 +109,7 @@ def test_options_reach_the_settings(monkeypatch, tmp_path):
     assert {name: settings[name] for name in expected} == expected
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpictured")
 def test_rows_that_answers_do_not_tell_apart_have_their_iteration(monkeypatch, capsys, tmp_path, finished):
     options = [*SHORT, "--iterations", "6", "--unasked-iterations", "5", "--kl-bound", "0.0734567"]

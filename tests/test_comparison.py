@@ -82,6 +82,7 @@ def test_folds_are_as_equal_as_they_can_be_and_the_same_for_all_candidates(monke
     assert not np.array_equal(other["fold"], result["fold"])
 
 
+@pytest.mark.slow
 def test_rows_of_one_answer_are_left_out_together():
     groups = np.array([0, 0, 2, 3, 3])
     candidates = {"a": PreferenceModel(likelihood="logistic")}

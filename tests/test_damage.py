@@ -133,7 +133,13 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("kind", DAMAGE)
+# those that differ in what is wrong with them
+FAST = ["text in place of states", "states beyond the grid", "lengths beyond the steps", "weights of another shape"]
+
+
+@pytest.mark.parametrize(
+    "kind", [*FAST, *(pytest.param(kind, marks=pytest.mark.slow) for kind in DAMAGE if kind not in FAST)]
+)
 def test_a_damaged_iteration_file_is_named(gridworld_copy, kind):
     name, data = DAMAGE[kind]
     rewritten(gridworld_copy / "iterations" / "0003.nc", name, data)

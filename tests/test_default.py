@@ -77,6 +77,7 @@ def test_a_policy_is_tried_without_its_noise_from_starts_that_all_policies_share
     assert run.last_policy.policy.action_standard_deviation(observation[None]) > 0
 
 
+@pytest.mark.slow
 def test_undo_takes_back_which_policies_were_tried_and_kept():
     straight, undone = (Learner(Slope(), answers=3, **FAST) for _ in range(2))
     straight.run(ReturnExpert())
@@ -127,6 +128,7 @@ def test_a_policy_without_a_mode_is_tried_and_kept_with_its_noise():
         actor.predict(np.zeros((1, 2)), deterministic=True)
 
 
+@pytest.mark.slow
 def test_a_run_of_an_earlier_version_which_tried_no_policy_goes_on(run, tmp_path):
     """Its kept policy stays the same, with its noise, until it is continued."""
     directory = shutil.copytree(run.path, tmp_path / "old")
@@ -148,6 +150,7 @@ def test_a_run_of_an_earlier_version_which_tried_no_policy_goes_on(run, tmp_path
     assert learner.policy is not learner.state.best_policy
 
 
+@pytest.mark.slow
 def test_a_step_back_goes_on_from_the_kept_policy_with_less_trust():
     """An estimate that calls the newest trajectories worse sends the next update back to the best policy."""
     learner = Learner(Slope(), answers=3, **FAST)
@@ -167,6 +170,7 @@ class Unseeded(Slope):
         return super().reset(seed=None, options=options)
 
 
+@pytest.mark.slow
 def test_an_environment_that_no_seed_resets_is_compared_across_starts():
     learner = Learner(Unseeded(), answers=3, same_start=True, **FAST).run(ReturnExpert())
     assert learner.comparable_starts is False
@@ -187,7 +191,9 @@ def test_a_stopped_run_of_the_default_goes_on_bit_for_bit(tmp_path):
     assert again.state.trust == whole.state.trust
 
 
-@pytest.mark.parametrize("env", ["swing-up", "Pendulum-v1", "CartPole-v1", "acrobot"])
+@pytest.mark.parametrize(
+    "env", ["swing-up", "Pendulum-v1", "CartPole-v1", pytest.param("acrobot", marks=pytest.mark.slow)]
+)
 def test_equal_starts_give_equal_first_states_and_other_actions(env):
     environment = rollouts.open_environment(env)
     policy = Learner(env, seed=1).last_policy

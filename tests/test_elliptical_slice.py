@@ -13,6 +13,8 @@ from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.elliptical_slice import BATCHES_AHEAD, Ellipse, elliptical_moves
 from bayespbrl.models.likelihoods import Logistic, Mixed
 
+pytestmark = pytest.mark.empties_caches
+
 
 @pytest.fixture(autouse=True, scope="module")
 def quick_compilation():

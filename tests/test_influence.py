@@ -77,6 +77,7 @@ def test_refits_are_of_the_answers_with_the_largest_estimated_change(steep):
     np.testing.assert_array_equal(some["converged"], refitted)
 
 
+@pytest.mark.slow
 def test_the_change_is_of_the_margins_with_the_side_bias_in_them():
     sides = np.array([1, 1, -1])
     tree = sample_posterior(CONTRADICTED[:3], shown_first=sides, likelihood="logistic", **SAMPLING)

@@ -106,6 +106,7 @@ def agree(tree, expected):
         assert np.all(np.abs(value.mean(axis=(0, 1)) - expected[name]) < 4 * error + 2e-3), name
 
 
+@pytest.mark.slow
 def test_everything_together_agrees_with_quadrature():
     tree = sample_posterior(SETTINGS, **INFERRED, **SAMPLING)
     expected, evidence = quadrature(SETTINGS)
@@ -139,6 +140,7 @@ def test_a_side_bias_and_two_answerers_agree_with_quadrature():
     agree(tree, quadrature(SETTINGS[:1], answerers=answerers)[0])
 
 
+@pytest.mark.slow
 def test_each_of_two_answerers_has_a_lapse_rate_and_a_side_bias_as_by_quadrature():
     rows, sides, who = SETTINGS[0, :, 0], np.array([1, -1, 1, 1]), np.array([0, 1, 1, 0])
     tree = sample_posterior(
@@ -177,6 +179,7 @@ def test_the_side_bias_has_its_whole_prior_where_the_features_explain_the_answer
     assert bias.std() == pytest.approx(priors.SIDE_BIAS_SCALE, rel=0.1)
 
 
+@pytest.mark.slow
 def test_names_are_kept_by_number_also_of_whom_no_answer_is_left():
     rows, sides = SETTINGS[0], np.array([1, -1, 1, 1])
     answers = Answers(None, sides, ["Bob", "Ada", "Ada", "Bob"]).checked(4)

@@ -646,6 +646,7 @@ def test_compilations_do_not_grow_with_the_iterations():
 
 
 @pytest.mark.slow
+@pytest.mark.empties_caches
 def test_compilations_of_the_sampler_grow_with_its_capacity_only():
     # 11 answers an iteration: the third takes them beyond 32, the first capacity
     jax.clear_caches()  # or what other tests compiled would not be counted here
@@ -702,6 +703,7 @@ def test_exploration_is_held_for_as_many_steps_as_the_settings_say(monkeypatch):
     assert held == [4, 4]
 
 
+@pytest.mark.slow
 def test_exploration_is_held_for_a_share_of_the_first_episodes_where_they_end_early(monkeypatch):
     held, rollout = [], rollouts.rollout
 

@@ -64,7 +64,7 @@ def test_posterior_of_a_hundred_answers_is_that_of_quadrature(name):
     assert tree.attrs["log_evidence"] == pytest.approx(log_evidence, abs=4 * tree.attrs["log_evidence_error"] + 0.02)
 
 
-@pytest.mark.parametrize("move", ["axis", "independent"])
+@pytest.mark.parametrize("move", [pytest.param("axis", marks=pytest.mark.slow), "independent"])
 def test_a_move_of_its_own_kind_leaves_the_posterior_as_it_is(move):
     rows, steepness, lapse_rate = answers(70, seed=5), 5.0, 0.2
     model = PreferenceModel(1.0, steepness, lapse_rate)

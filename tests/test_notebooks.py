@@ -34,20 +34,33 @@ def test_there_is_a_notebook():
     assert NOTEBOOKS
 
 
+@pytest.fixture(scope="module")
+def kernel():
+    """One kernel for all notebooks: importing the package and tracing its programs takes longer than most cells."""
+    from jupyter_client.manager import KernelManager
+
+    with pytest.MonkeyPatch.context() as environment:
+        environment.delenv("BAYESPBRL_FULL", raising=False)
+        manager = KernelManager(kernel_name="python3")
+        manager.start_kernel(cwd=NOTEBOOKS[0].parent)
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
 @pytest.mark.slow
 @each_notebook
-def test_every_notebook_runs_from_a_fresh_kernel_without_error_or_warning(path, monkeypatch):
+def test_every_notebook_runs_from_an_empty_namespace_without_error_or_warning(path, kernel):
     import nbformat
     from nbclient import NotebookClient
 
-    monkeypatch.delenv("BAYESPBRL_FULL", raising=False)
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     for cell in code_cells(notebook):
         cell.outputs = []
-    NotebookClient(
-        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": path.parent}}
-    ).execute()
+    notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f"))
+    client = NotebookClient(notebook, km=kernel, timeout=300)
+    client.execute()
+    client.kc.stop_channels()
     outputs = [output for cell in code_cells(notebook) for output in cell.outputs]
     assert outputs
     assert [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"] == []

@@ -90,6 +90,7 @@ def test_the_opposite_question_has_the_opposite_answer(settings):
     assert abs(forth[0, 0] - forth[0, 1]) > 0.1
 
 
+@pytest.mark.slow
 def test_each_draw_predicts_by_its_own_setting_steepness_and_lapse_rate():
     tree = sample_posterior(
         np.array([KNOWN, 3.0 * KNOWN[:, ::-1]]), steepness=None, lapse_rate=None, likelihood="logistic", **SAMPLING
@@ -103,6 +104,7 @@ def test_each_draw_predicts_by_its_own_setting_steepness_and_lapse_rate():
     np.testing.assert_allclose(answer_probabilities(tree, asked)[0], [p.mean(), 1 - p.mean(), 0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_without_answers_the_prior_predicts():
     nothing, everything = np.zeros(5, dtype=bool), np.ones(5, dtype=bool)
     model = PreferenceModel(steepness=2.0, tie_threshold=0.4, likelihood="probit", prior_scale=0.7)

@@ -210,6 +210,7 @@ def test_each_draw_is_of_the_features_of_its_own_setting(walked):
         np.testing.assert_allclose(draws[draw], features @ weights[draw] / estimate.scales[number], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_setting_of_a_very_different_scale_counts_by_its_probability_alone():
     # the features of the second setting are those of the first, times 1000: nothing can tell the settings apart
     one = inference.estimate(
@@ -248,6 +249,7 @@ def test_the_likelihood_of_the_next_answer_has_the_steepness_and_lapse_rate_of_e
     assert len(np.unique(drawn["lapse_rate"])) > 1
 
 
+@pytest.mark.slow
 def test_the_likelihood_has_what_was_given_in_every_draw():
     comparisons = Comparisons.among(TRAJECTORIES, PAIRS, discount=0.9)
     model = PreferenceModel(steepness=3.0, lapse_rate=0.25)
@@ -270,6 +272,7 @@ def test_what_was_inferred_is_summed_up_by_mean_and_interval(walked):
     assert 1 / 9 < found["most probable length scales"] < 1
 
 
+@pytest.mark.slow
 def test_ties_bring_equal_utilities_and_an_inferred_threshold():
     tied, stated = (
         inference.infer_utility(np.eye(3), pairs, ties=ties, likelihood="logistic", seed=0)

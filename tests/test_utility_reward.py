@@ -61,6 +61,7 @@ def test_a_discrete_task_of_ours_earns_utility_too(gridworld_run):
     assert reward == pytest.approx(run.estimate.utilities(np.array([observation]))[0])
 
 
+@pytest.mark.slow
 def test_other_spaces_and_runs_without_an_estimate_are_refused(pendulum, tmp_path):
     with pytest.raises(ValueError, match=r"^observation_space: expected Box.*, the run's, got Box"):
         UtilityReward(gymnasium.make("CartPole-v1"), pendulum)
@@ -83,7 +84,7 @@ def linear(tmp_path_factory):
     return run_of("Pendulum-v1", tmp_path_factory.mktemp("runs") / "linear", policy="linear-gaussian")
 
 
-@pytest.mark.parametrize("task", ["pendulum", "cartpole", "linear"])
+@pytest.mark.parametrize("task", ["pendulum", "cartpole", pytest.param("linear", marks=pytest.mark.slow)])
 def test_predict_takes_one_observation_or_many(request, task):
     run = request.getfixturevalue(task)
     env = gymnasium.make(run.settings.env)
