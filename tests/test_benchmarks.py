@@ -15,6 +15,7 @@ from toys import QUICK
 
 import bayespbrl
 from bayespbrl.models import PreferenceModel, fit_gaussian, sample_posterior
+from bayespbrl.models.convergence import chain_convergence
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 CYCLE = BENCHMARKS / "cycle.py"
@@ -80,6 +81,26 @@ def test_a_schedule_costs_what_updates_with_it_take_longer(printed):
     assert 0 < result["updates_without"] < result["seconds_without"]
     longer = result["updates_with"] - result["updates_without"]
     assert result["overhead"] == pytest.approx(longer / result["seconds_without"], abs=0.02 / result["seconds_without"])
+
+
+@pytest.mark.slow
+def test_the_posterior_of_many_answers_is_timed_beside_that_of_nuts(tmp_path, printed):
+    printed("many_answers", "--answers", 8, "--features", 3, "--draws", 400, "--out", tmp_path / "table.csv")
+    (line,) = pd.read_csv(tmp_path / "table.csv").to_dict("records")
+    assert (line["answers"], line["features"]) == (8, 3)
+    for name in ("ours", "nuts"):
+        assert line[f"{name}_rhat"] < 1.05
+        assert line[f"{name}_effective"] > 50
+        assert 0 < line[f"{name}_seconds_compiled"] < line[f"{name}_seconds_compiling"]
+        rate = line[f"{name}_effective"] / line[f"{name}_seconds_compiled"]
+        assert line[f"{name}_effective_per_second_compiled"] == pytest.approx(rate, rel=0.01)
+    ratio = line["ours_effective_per_second_compiled"] / line["nuts_effective_per_second_compiled"]
+    assert line["ratio_compiled"] == pytest.approx(ratio, rel=0.01)
+    module = benchmark("many_answers")
+    differences = module.answers(8, 3, seed=0)
+    of_both = [module.ours(differences, 1), module.theirs(draws=400)(differences, 1)]
+    error = np.hypot(*(chain_convergence(margins).monte_carlo_error for margins in of_both))
+    assert np.all(np.abs(of_both[0].mean((0, 1)) - of_both[1].mean((0, 1))) < 4 * error)
 
 
 def test_studies_are_compared_seed_by_seed(tmp_path, printed):

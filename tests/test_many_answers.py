@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayespbrl.models import PreferenceModel, fit_gaussian, priors, sample_posterior
-from bayespbrl.models.chains import FEW
+from bayespbrl.models import PreferenceModel, fit_gaussian, priors, sample_posterior, step_moves
+from bayespbrl.models.chains import FEW, Chains, flight_draw
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.elliptical_slice import elliptical_moves, independent_move
 from bayespbrl.models.gaussian_fit import refitted
 from bayespbrl.models.likelihoods import likelihood_of, prob
 from bayespbrl.models.preference_problem import axis_ellipse, padded_problem, reference_ellipse
+from bayespbrl.models.split_dynamics import split_move
 
 GRID = np.linspace(-4.5, 4.5, 91)
 POINTS = np.stack(np.meshgrid(GRID, GRID, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -64,10 +65,39 @@ def test_posterior_of_a_hundred_answers_is_that_of_quadrature(name):
     assert tree.attrs["log_evidence"] == pytest.approx(log_evidence, abs=4 * tree.attrs["log_evidence_error"] + 0.02)
 
 
-@pytest.mark.parametrize("move", [pytest.param("axis", marks=pytest.mark.slow), "independent"])
+@pytest.mark.parametrize("transport", [False, True])
+def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterior_of_quadrature(transport, monkeypatch):
+    monkeypatch.setattr(step_moves, "MANY_DIMENSIONS", 0 if transport else 2**20)
+    rows = answers(12, seed=7)
+    rows = np.concatenate([rows, -0.5 * rows[:1], 2 * rows[1:2]])  # a wall of two answers for each of two
+    fit = fit_gaussian(rows, PreferenceModel(steepness=None, lapse_rate=None))
+    with jax.enable_x64(True):
+        chains = Chains.start([fit], num_chains=8, chunk=25, seed=0)
+        problem, steps = chains.problem, step_moves.steps_of([fit], chains.problem)
+        assert (steps.ladder is not None) == transport
+
+        def step(state, _):
+            *state, _ = flight_draw(*state, problem, steps)
+            return tuple(state), (state[0].z["utility_weights"][:2], state[1])
+
+        def chain(state, unknowns):
+            return jax.lax.scan(step, (state, unknowns), None, length=1500)[1]
+
+        z, unknowns = jax.jit(jax.vmap(chain))(chains.state, chains.unknowns)
+        log_m = np.log(np.asarray(problem.steepness.values))[np.asarray(unknowns.steepness)]
+        lapse_rate = np.asarray(problem.lapse_rate.values)[np.asarray(unknowns.lapse_rate)]
+    draws = np.concatenate([np.asarray(z) @ fit.factors.basis.T, log_m[..., None], lapse_rate], axis=2)[:, 50:]
+    expected, _ = quadrature(rows, "mixed")
+    error = chain_convergence(draws).monte_carlo_error
+    assert np.all(np.abs(draws.mean(axis=(0, 1)) - expected) < 4 * error)
+    assert np.all(error < 0.035 * draws.std(axis=(0, 1)))
+
+
+@pytest.mark.parametrize("move", [pytest.param("axis", marks=pytest.mark.slow), "independent", "split"])
 def test_a_move_of_its_own_kind_leaves_the_posterior_as_it_is(move):
     rows, steepness, lapse_rate = answers(70, seed=5), 5.0, 0.2
-    model = PreferenceModel(1.0, steepness, lapse_rate)
+    name = "logistic" if move == "split" else "mixed"
+    model = PreferenceModel(1.0, steepness, lapse_rate, name)
     fit = fit_gaussian(rows, model)
     with jax.enable_x64(True):
         problem = padded_problem(
@@ -87,6 +117,8 @@ def test_a_move_of_its_own_kind_leaves_the_posterior_as_it_is(move):
         def step(z, key):
             if move == "axis":
                 z, _, _ = elliptical_moves(key, z, axis_ellipse(problem), moves=2, batch=4, max_candidates=200)
+            elif move == "split":
+                z = split_move(key, z, problem._replace(excess=0.0, width=1.0))
             else:
                 z = independent_move(key, z, reference_ellipse(problem), candidates=64)
             return z, z
@@ -94,7 +126,7 @@ def test_a_move_of_its_own_kind_leaves_the_posterior_as_it_is(move):
         start = jnp.tile(problem.centre, (8, 1))
         keys = jax.random.split(jax.random.key(0), (8, 1500))
         draws = np.asarray(jax.jit(jax.vmap(lambda z, k: jax.lax.scan(step, z, k)[1]))(start, keys))[:, 50:]
-    density = log_density(rows, "mixed", steepness, lapse_rate)
+    density = log_density(rows, name, steepness, lapse_rate)
     mass = np.exp(density - density.max())
     mass /= mass.sum()
     squares = np.concatenate([draws, draws**2], axis=2)

@@ -1,6 +1,7 @@
 """Chains on everything that is unknown: Gibbs moves and elliptical slices, by one compiled sampler a capacity."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,6 +16,7 @@ from bayespbrl.models.elliptical_slice import Ellipse, independent_move
 from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords, Values
 from bayespbrl.models.gaussian_fit import GaussianFit
 from bayespbrl.models.gibbs import (
+    FEW,
     JointProblem,
     Table,
     Unknowns,
@@ -35,6 +37,8 @@ from bayespbrl.models.preference_problem import (
     reference_ellipse,
 )
 from bayespbrl.models.priors import Grid, given
+from bayespbrl.models.split_dynamics import split_move
+from bayespbrl.models.step_moves import Steps, step_moves, steps_of
 
 # Share of each answer's Gaussian factor that enters the reference: with all of it the reference is as narrow as the
 # posterior's bulk and its residual has no bound in the tails; with none of it the reference is the prior, which mixes
@@ -43,13 +47,12 @@ REFERENCE_POWER = 0.5
 # Moves around the reference's and the prior's ellipses per recorded draw; those around the prior's help in the tails.
 # They are made in so many sweeps, where more than the weights is unknown: lapse rate and weights move in turn.
 REFERENCE_MOVES, PRIOR_MOVES, SWEEPS = 26, 6, 6
-# Above so many answers, padding included, the moves are others, and the references are fitted again after the burn-in.
-FEW = 64
-# With steps: the same per sweep for at most so many dimensions, where so many independent draws are tried too; in more
-# dimensions every coordinate of the reference has a move of its own.
+# Above `FEW` answers the moves are others, and the references are fitted again after the burn-in. With steps and ties:
+# the same per sweep for at most so many dimensions, where so many independent draws are tried too; in more dimensions
+# every coordinate of the reference has a move of its own. With steps alone the weights move by flights.
 LOW_DIMENSION, STEP_MOVES, INDEPENDENT = 32, 24, 256
-# Without steps the reference is nearly the posterior.
-SMOOTH_MOVES = 4
+# Without steps the reference is nearly the posterior, and most is done by its dynamics.
+SMOOTH_MOVES = 1
 # Of the reference that is fitted again: among contradicting answers the posterior is wider than any one Gaussian fit.
 LEAST_POWER = 0.2
 # The least lapse rate of a reference: with none, answers that contradict each other leave no Gaussian.
@@ -58,12 +61,17 @@ LEAST_LAPSES = 0.005
 CHUNK = 25
 
 
+Recorded = tuple[EllipticalSliceState, Unknowns, Float[Array, "*draws k"]]
+Drawn = tuple[tuple[EllipticalSliceState, Unknowns], Recorded]
+
+
 @dataclass(frozen=True)
 class Chains:
     """Chains that can be extended, a chunk of fixed length at a time.
 
     Attributes:
       problem: what they sample.
+      steps: what the moves need among the steps of many answers.
       state, unknowns: of all chains after their last draw.
       chunk: draws per call of the compiled sampler.
       rank, number: r and K, without the padding.
@@ -76,6 +84,7 @@ class Chains:
     chunk: int
     rank: int
     number: int
+    steps: Steps | None = None
     draws: tuple[dict[str, Shaped[np.ndarray, "chain draw ..."]], ...] = ()
 
     @classmethod
@@ -107,7 +116,8 @@ class Chains:
         no = zeros.astype(bool)
         keys = jax.random.split(jax.random.key(seed), num_chains)
         state = EllipticalSliceState({"utility_weights": start}, zeros, zeros, no, no, keys)
-        return cls(problem, state, unknowns, chunk, rank, len(fits[0].differences))
+        steps = steps_of(fits, problem) if _flies(problem) else None
+        return cls(problem, state, unknowns, chunk, rank, len(fits[0].differences), steps)
 
     @property
     def many(self) -> bool:
@@ -151,12 +161,18 @@ class Chains:
         """At least `more` draws longer."""
         draws, state, unknowns = list(self.draws), self.state, self.unknowns
         for _ in range(-(-more // self.chunk)):
-            (state, unknowns), (states, them, answers) = draw_chunk(state, unknowns, self.problem, length=self.chunk)
+            (state, unknowns), (states, them, answers) = self._next_chunk(state, unknowns, compiled=bool(draws))
             z, log_p = np.asarray(states.z["utility_weights"]), np.asarray(answers)
             flags = {name: np.asarray(getattr(states, name)) for name in ("candidates", "stuck", "diverging")}
             part = {"coordinates": z[:, :, : self.rank], "answers": log_p[:, :, : self.number], **flags}
             draws.append(part | {name: np.asarray(value) for name, value in them._asdict().items()})
         return replace(self, state=state, unknowns=unknowns, draws=tuple(draws))
+
+    def _next_chunk(self, state: EllipticalSliceState, unknowns: Unknowns, *, compiled: bool) -> Drawn:
+        if self.steps is None:
+            return draw_chunk(state, unknowns, self.problem, length=self.chunk)
+        # several threads would each compile
+        return flight_chunk(state, unknowns, self.problem, self.steps, length=self.chunk, at_once=compiled)
 
     def collected(self, name: str, length: int) -> Shaped[np.ndarray, "chain {length} ..."]:
         """The first `length` draws of what is called `name`."""
@@ -231,7 +247,12 @@ KERNEL, KERNEL_OF_SWEEP = (
     EllipticalSlice(low_rank_model, batch=8, ellipses=partial(_ellipses, sweeps=sweeps), log_likelihood=_log_likelihood)
     for sweeps in (1, SWEEPS)
 )
-Recorded = tuple[EllipticalSliceState, Unknowns, Float[Array, "*draws k"]]
+
+
+def _flies(problem: JointProblem) -> bool:
+    """Whether the weights move by flights: many answers, and one step each."""
+    likelihood = problem.settings.likelihood
+    return problem.settings.loadings.shape[1] > FEW and has_steps(likelihood) and not isinstance(likelihood, WithTies)
 
 
 def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem) -> Recorded:
@@ -250,6 +271,8 @@ def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem)
         if independent:
             ellipse = reference_ellipse(conditional(problem, unknowns))
             z = independent_move(random.fold_in(sub, 1), z, ellipse, candidates=INDEPENDENT)
+        if capacity > FEW and not has_steps(problem.settings.likelihood):
+            z = split_move(random.fold_in(sub, 1), z, conditional(problem, unknowns))
         state = state._replace(z={"utility_weights": z}, rng_key=key)
         state = kernel.sample(state, (conditional(problem, unknowns),), {})
         return (state, unknowns), (state.candidates, state.stuck)
@@ -260,22 +283,58 @@ def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem)
     return state, unknowns, log_prob(one.likelihood, one.loadings @ state.z["utility_weights"])
 
 
+def flight_draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem, steps: Steps) -> Recorded:
+    """As `draw`, by flights; a flight that is given up counts as stuck."""
+    key, *keys = random.split(state.rng_key, 3)
+    z, unknowns = moved(keys[0], state.z["utility_weights"], unknowns, problem)
+    z, margins, unknowns, given_up = step_moves(keys[1], z, unknowns, problem, steps)
+    one = conditional(problem, unknowns)
+    log_p = total_log_prob(one.likelihood, margins, one.used)
+    state = EllipticalSliceState(
+        {"utility_weights": z}, log_p, jnp.ones_like(state.candidates), given_up, ~jnp.isfinite(log_p), key
+    )
+    return state, unknowns, log_prob(one.likelihood, margins)
+
+
 # Level 1 compiles faster, and a loop over small vectors runs as fast.
 @partial(jax.jit, static_argnames="length", compiler_options={"xla_backend_optimization_level": 1})
 def draw_chunk(
-    state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem, *, length: int
-) -> tuple[tuple[EllipticalSliceState, Unknowns], Recorded]:
-    """`length` draws of all chains: the last, and all (chain, draw, ...) with log p of each answer at each."""
+    state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem, steps: Steps | None = None, *, length: int
+) -> Drawn:
+    """`length` draws of all chains, with `steps` of one: the last, and all, with log p of each answer at each."""
 
-    def chain(
-        state: EllipticalSliceState, unknowns: Unknowns
-    ) -> tuple[tuple[EllipticalSliceState, Unknowns], Recorded]:
-        def step(
-            last: tuple[EllipticalSliceState, Unknowns], _: None
-        ) -> tuple[tuple[EllipticalSliceState, Unknowns], Recorded]:
-            state, unknowns, answers = draw(*last, problem)
+    def chain(state: EllipticalSliceState, unknowns: Unknowns) -> Drawn:
+        def step(last: tuple[EllipticalSliceState, Unknowns], _: None) -> Drawn:
+            drawn = draw(*last, problem) if steps is None else flight_draw(*last, problem, steps)
+            state, unknowns, answers = drawn
             return (state, unknowns), (state._replace(rng_key=jnp.zeros(())), unknowns, answers)
 
         return lax.scan(step, (state, unknowns), None, length=length)
 
-    return jax.vmap(chain)(state, unknowns)
+    if steps is None:
+        return jax.vmap(chain)(state, unknowns)
+    return chain(state, unknowns)
+
+
+def flight_chunk(
+    state: EllipticalSliceState,
+    unknowns: Unknowns,
+    problem: JointProblem,
+    steps: Steps,
+    *,
+    length: int,
+    at_once: bool,
+) -> Drawn:
+    """As `draw_chunk`, each chain by itself, so that none waits for a longer flight; `at_once` in several threads."""
+
+    def one(number: int) -> Drawn:
+        with jax.enable_x64(True):  # a setting of the thread
+            start = jax.tree.map(lambda all_chains: all_chains[number], (state, unknowns))
+            drawn: Drawn = draw_chunk(*start, problem, steps, length=length)
+            drawn[1][2].block_until_ready()
+            return drawn
+
+    numbers = range(len(unknowns.setting))
+    with ThreadPoolExecutor(len(numbers) if at_once else 1) as pool:
+        chains: Drawn = jax.tree.map(lambda *each: jnp.stack(each), *pool.map(one, numbers))
+    return chains

@@ -86,6 +86,9 @@ def _log_ratios(problem: JointProblem, z: Float[Array, "n q"], unknowns: Unknown
         log_p = log_likelihood(problem, unknowns, given.loadings @ z)
         whitened = given.inverse_root @ (z - given.centre)
         scale = given.prior_scale
+        if given.width is not None:
+            whitened /= given.width
+            log_p += len(z) * jnp.log(given.width)
         log_p += 0.5 * jnp.sum(whitened**2) - 0.5 * jnp.sum(z**2) / scale**2 - len(z) * jnp.log(scale)
         return log_p + jnp.sum(jnp.log(jnp.diagonal(given.root)))
 

@@ -134,7 +134,7 @@ def repeated_moments(
     return float(top + np.log(z)), float(tilted), float(density @ (t - tilted) ** 2 / z)
 
 
-def _same_margins(
+def same_margins(
     loadings: Float[np.ndarray, "k r"],
 ) -> list[tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]]:
     """The rows of L in groups that are parallel, in the order of the first of each, and their ratios to it."""
@@ -159,7 +159,7 @@ class _Factors:
     """The likelihood as a function of one margin for each of G groups of answers."""
 
     def __init__(self, loadings: Float[np.ndarray, "k r"], mixture: ProbitMixture) -> None:
-        groups = _same_margins(loadings)
+        groups = same_margins(loadings)
         self.first = np.array([group[0] for group, _ in groups], dtype=int)
         self.single = np.array([len(group) == 1 for group, _ in groups], dtype=bool)
         self.mixture = mixture.of(self.first)

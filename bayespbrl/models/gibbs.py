@@ -11,14 +11,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from bayespbrl.models.likelihoods import Likelihood, Margins, Scalar, Values, WithLapses, WithTies, log_prob
+from bayespbrl.models.likelihoods import Likelihood, Margins, Scalar, Values, WithLapses, WithTies, has_steps, log_prob
 from bayespbrl.models.preference_problem import PreferenceProblem
 
+# Up to so many answers, padding included, nothing is spared: their moves are others.
+FEW = 64
 STACKED = ("loadings", "used", "centre", "site_precisions", "root", "inverse_root")
 
 
@@ -59,7 +62,7 @@ class Unknowns(NamedTuple):
     tie_threshold: Int[Array, "*chains"]
 
 
-class _Point(NamedTuple):
+class Point(NamedTuple):
     """The values of the unknowns; of λ one for each answer, zero in padded rows."""
 
     steepness: Values
@@ -67,8 +70,8 @@ class _Point(NamedTuple):
     tie_threshold: Values
 
 
-def _point(problem: JointProblem, unknowns: Unknowns) -> _Point:
-    return _Point(
+def point_of(problem: JointProblem, unknowns: Unknowns) -> Point:
+    return Point(
         problem.steepness.values[unknowns.steepness],
         problem.lapse_rate.values[unknowns.lapse_rate] @ problem.answerers,
         problem.tie_threshold.values[unknowns.tie_threshold],
@@ -89,15 +92,24 @@ def prior_draws(problem: JointProblem, rng: np.random.Generator, number: int) ->
     ]
 
 
+def at_setting(stacked_parts: Any, setting: Int[Array, ""]) -> Any:
+    """The parts of one setting; without a copy where there is only one."""
+    return jax.tree.map(lambda each: each[0] if len(each) == 1 else each[setting], stacked_parts)
+
+
 def conditional(problem: JointProblem, unknowns: Unknowns) -> PreferenceProblem:
     """The problem of the weights given all else."""
-    parts: dict[str, Array] = {name: getattr(problem.settings, name)[unknowns.setting] for name in STACKED}
-    if problem.fitted_steepness is not None:
-        scale = reference_scale(problem, unknowns)
-        parts = parts | {name: parts[name] * scale for name in ("centre", "root")}
-        parts |= {"inverse_root": parts["inverse_root"] / scale, "site_precisions": parts["site_precisions"] / scale**2}
-        parts["excess"] = (1 / scale**2 - 1) / problem.settings.prior_scale**2
-    return problem.settings._replace(likelihood=_likelihood(problem, _point(problem, unknowns)), **parts)
+    settings = problem.settings
+    stacks = {name: getattr(settings, name) for name in STACKED}
+    if settings.loadings.shape[1] <= FEW:
+        parts: dict[str, Array] = {name: each[unknowns.setting] for name, each in stacks.items()}
+    else:
+        parts = at_setting(stacks, unknowns.setting)
+        if not has_steps(settings.likelihood):
+            scale = reference_scale(problem, unknowns)
+            parts |= {"centre": parts["centre"] * scale, "site_precisions": parts["site_precisions"] / scale**2}
+            parts |= {"width": scale, "excess": (1 / scale**2 - 1) / settings.prior_scale**2}
+    return settings._replace(likelihood=_likelihood(problem, point_of(problem, unknowns)), **parts)
 
 
 def reference_scale(problem: JointProblem, unknowns: Unknowns) -> Values:
@@ -118,12 +130,14 @@ def moved(
         z, unknowns = _steepness_move(random.fold_in(key, 0), z, unknowns, problem)
     if len(problem.tie_threshold.values) > 1:
         z, unknowns = _threshold_move(random.fold_in(key, 1), z, unknowns, problem)
-    margins = problem.settings.loadings[unknowns.setting] @ z
+    loadings = problem.settings.loadings
+    few = loadings.shape[1] <= FEW
+    margins = (loadings[unknowns.setting] if few else at_setting(loadings, unknowns.setting)) @ z
     for key, name in zip(keys[1:], ("steepness", "lapse_rate", "tie_threshold"), strict=True):
         prior: Table = getattr(problem, name)
         if len(prior.values) > 1:
-            every = _point(problem, unknowns)._replace(**{name: prior.values[:, None]})
-            log_p = _log_probabilities(problem, every, margins)
+            every = point_of(problem, unknowns)._replace(**{name: prior.values[:, None]})
+            log_p = log_probabilities(problem, every, margins)
             # each answerer's lapse rate is drawn from the answers of that one, all else from all answers
             log_p = problem.answerers @ log_p.T if name == "lapse_rate" else log_p.sum(axis=1)
             unknowns = unknowns._replace(**{name: random.categorical(key, log_p + prior.log_probabilities)})
@@ -152,10 +166,12 @@ def _steepness_move(
 
     Many answers determine the product well, and neither m given z nor z given m could then move.
     """
-    values = problem.steepness.values
-    every = _point(problem, unknowns)._replace(steepness=values[:, None])
-    log_p = problem.steepness.log_probabilities
-    z, chosen = _scaled(key, z, values[unknowns.steepness] / values, every, log_p, unknowns, problem)
+    values, loadings = problem.steepness.values, at_setting(problem.settings.loadings, unknowns.setting)
+    every = point_of(problem, unknowns)._replace(steepness=values[:, None])
+    scales = values[unknowns.steepness] / values
+    margins = scales[:, None] * (loadings @ z)
+    log_p = jnp.sum(log_probabilities(problem, every, margins), axis=1) + problem.steepness.log_probabilities
+    z, chosen = _scaled(key, z, scales, log_p, unknowns, problem)
     return z, unknowns._replace(steepness=chosen)
 
 
@@ -164,9 +180,13 @@ def _threshold_move(
 ) -> tuple[Float[Array, " q"], Unknowns]:
     """Tie threshold δ and weights z δ/δ₀ drawn together: which answers are ties determines their ratio well."""
     values = problem.tie_threshold.values
-    every = _point(problem, unknowns)._replace(tie_threshold=values[:, None])
-    log_p = problem.tie_threshold.log_probabilities
-    z, chosen = _scaled(key, z, values / values[unknowns.tie_threshold], every, log_p, unknowns, problem)
+    every = point_of(problem, unknowns)._replace(tie_threshold=values[:, None])
+    scales = values / values[unknowns.tie_threshold]
+    loadings = problem.settings.loadings[unknowns.setting]
+    points = jnp.where(jnp.any(loadings != 0, axis=0), scales[:, None] * z, z)
+    log_p = jnp.sum(log_probabilities(problem, every, points @ loadings.T), axis=1)
+    log_p += problem.tie_threshold.log_probabilities
+    z, chosen = _scaled(key, z, scales, log_p, unknowns, problem)
     return z, unknowns._replace(tie_threshold=chosen)
 
 
@@ -174,16 +194,16 @@ def _scaled(
     key: PRNGKeyArray,
     z: Float[Array, " q"],
     scales: Values,
-    every: _Point,
-    log_prior: Values,
+    log_p: Values,
     unknowns: Unknowns,
     problem: JointProblem,
 ) -> tuple[Float[Array, " q"], Int[Array, ""]]:
-    """One of the points of `every`, each with the weights scaled as it says: r coordinates have the volume scale^r."""
-    loadings = problem.settings.loadings[unknowns.setting]
-    scaled = jnp.any(loadings != 0, axis=0)  # all but padding
+    """The weights times one of the scales, and its number; r coordinates have the volume scale^r.
+
+    `log_p` is that of the answers, and of the scale a priori.
+    """
+    scaled = jnp.any(problem.settings.loadings[unknowns.setting] != 0, axis=0)  # all but padding
     points = jnp.where(scaled, scales[:, None] * z, z)
-    log_p = jnp.sum(_log_probabilities(problem, every, points @ loadings.T), axis=1) + log_prior
     log_p -= 0.5 * jnp.sum(points**2, axis=1) / problem.settings.prior_scale**2
     chosen = random.categorical(key, log_p + jnp.sum(scaled) * jnp.log(scales))
     return points[chosen], chosen
@@ -191,26 +211,26 @@ def _scaled(
 
 def log_likelihood(problem: JointProblem, unknowns: Unknowns, margins: Margins) -> Values:
     """Σ log p of the answers, those of padded rows left out."""
-    return jnp.sum(_log_probabilities(problem, _point(problem, unknowns), margins), axis=-1)
+    return jnp.sum(log_probabilities(problem, point_of(problem, unknowns), margins), axis=-1)
 
 
-def _log_probabilities(problem: JointProblem, point: _Point, margins: Margins) -> Values:
+def log_probabilities(problem: JointProblem, point: Point, margins: Margins) -> Values:
     """log p of each answer, 0 in padded rows."""
     real = problem.answerers.sum(axis=0) > 0
     return jnp.where(real, log_prob(_likelihood(problem, point), margins), 0)
 
 
-def _likelihood(problem: JointProblem, point: _Point) -> Likelihood:
-    likelihood: Likelihood = _with_values(problem.settings.likelihood, point)
+def _likelihood(problem: JointProblem, point: Point) -> Likelihood:
+    likelihood: Likelihood = likelihood_with(problem.settings.likelihood, point)
     return likelihood
 
 
-def _with_values(template: Any, point: _Point) -> Any:
+def likelihood_with(template: Any, point: Point) -> Any:
     """The likelihood with other values in it."""
     if isinstance(template, WithTies):
-        return replace(template, ordered=_with_values(template.ordered, point), threshold=point.tie_threshold)
+        return replace(template, ordered=likelihood_with(template.ordered, point), threshold=point.tie_threshold)
     if isinstance(template, WithLapses):
-        return replace(template, attentive=_with_values(template.attentive, point), lapse_rate=point.lapse_rate)
+        return replace(template, attentive=likelihood_with(template.attentive, point), lapse_rate=point.lapse_rate)
     return replace(template, steepness=point.steepness)
 
 

@@ -34,6 +34,7 @@ class PreferenceProblem(NamedTuple):
       site_precisions: s of the reference's precision (1/σ² + e) I + Lᵀ diag(s) L.
       root, inverse_root: A, with AAᵀ the reference's covariance, and A⁻¹.
       excess: e; None for zero.
+      width: w where there is an excess; the reference's covariance is then w² AAᵀ.
     """
 
     loadings: Float[Array, "c q"]
@@ -45,6 +46,7 @@ class PreferenceProblem(NamedTuple):
     root: Float[Array, "q q"]
     inverse_root: Float[Array, "q q"]
     excess: Scalar | None = None
+    width: Scalar | None = None
 
 
 def low_rank_model(problem: PreferenceProblem) -> None:
@@ -62,9 +64,9 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
     """
     loadings, centre = problem.loadings, problem.centre
     number, rank = loadings.shape
-    map_displacement = jnp.concatenate([loadings, centre[None] / problem.prior_scale**2])
     if problem.excess is not None:
-        return _scaled_ellipse(problem, map_displacement, problem.excess)
+        return _scaled_ellipse(problem, problem.excess)
+    map_displacement = jnp.concatenate([loadings, centre[None] / problem.prior_scale**2])
     map_noise = (map_displacement @ problem.root).T
     margins_at_centre = loadings @ centre
 
@@ -83,13 +85,15 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
     return Ellipse(lift, noise, residual, lambda v: centre + problem.root @ v[number + 1 :])
 
 
-def _scaled_ellipse(problem: PreferenceProblem, map_displacement: Float[Array, "rows q"], excess: Scalar) -> Ellipse:
+def _scaled_ellipse(problem: PreferenceProblem, excess: Scalar) -> Ellipse:
     """`reference_ellipse` with an excess: v = (L(z − m), mᵀ(z − m)/σ², z − m)."""
     loadings, centre = problem.loadings, problem.centre
     number, rank = loadings.shape
-    everything = jnp.concatenate([map_displacement, jnp.eye(rank)])
-    map_noise = (everything @ problem.root).T
-    margins_at_centre = loadings @ centre
+    margins_at_centre, width = loadings @ centre, 1.0 if problem.width is None else problem.width
+
+    def lifted(displacement: Float[Array, "*j q"]) -> Float[Array, "*j v"]:
+        tilt = displacement @ centre[:, None] / problem.prior_scale**2
+        return jnp.concatenate([displacement @ loadings.T, tilt, displacement], axis=-1)
 
     def residual(v: Float[Array, "j v"]) -> Float[Array, " j"]:
         margins, tilt, displacement = v[:, :number], v[:, number], v[:, number + 1 :]
@@ -98,9 +102,11 @@ def _scaled_ellipse(problem: PreferenceProblem, map_displacement: Float[Array, "
         return log_likelihood + 0.5 * squares - tilt
 
     def noise(key: PRNGKeyArray, moves: int) -> Float[Array, "{moves} v"]:
-        return random.normal(key, (moves, rank), dtype=loadings.dtype) @ map_noise
+        # one product after the other: that of both matrices would cost more than all moves
+        whitened = random.normal(key, (moves, rank), dtype=loadings.dtype)
+        return lifted(jnp.asarray(width * (whitened @ problem.root.T)))
 
-    return Ellipse(lambda z: everything @ (z - centre), noise, residual, lambda v: centre + v[number + 1 :])
+    return Ellipse(lambda z: lifted(z - centre), noise, residual, lambda v: centre + v[number + 1 :])
 
 
 def axis_ellipse(problem: PreferenceProblem) -> Ellipse:

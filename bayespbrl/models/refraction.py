@@ -1,0 +1,164 @@
+"""Flights among steps: Hamiltonian dynamics of a Gaussian times a likelihood that jumps, without a step size.
+
+Under eq. 8 the posterior of z ~ N(0, σ²I) is a Gaussian times a factor that jumps where a margin changes its sign.
+Between these walls the dynamics of the Gaussian are a rotation of position and velocity, so that the next wall is found
+in closed form. At a wall the velocity along its normal changes as the energy demands: the flight goes through with
+another speed, or is reflected (hard walls: Pakman & Paninski 2014; finite ones: Afshar & Domke 2015). What else the
+likelihood changes between the walls is small, and corrected by a Metropolis test.
+
+The lapse rates are summed out: the height of a wall depends on how many answers are violated by then. Given the lapse
+rate the number of violations hardly changes, nor does the lapse rate given that number.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax, random
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+
+# Of a flight, radians: a quarter of the period, after which nothing is left of the position where there are no walls.
+DURATION = np.pi / 2
+# Walls that a flight may meet, per answer; a flight that meets more is rejected.
+MOST_EVENTS = 20
+
+
+class Walls(NamedTuple):
+    """Where the likelihood of z = σ y jumps: at normals · y = 0.
+
+    Attributes:
+      normals: σ L.
+      products: of the normals with each other.
+      relieved: how many answers of each answerer cease to be violated where the margin becomes positive, less those
+        that begin to be; zero where an earlier answer is about the same margin up to a factor, and counts for both.
+    """
+
+    normals: Float[Array, "c q"]
+    products: Float[Array, "c c"]
+    relieved: Float[Array, "c a"]
+
+
+class _Flight(NamedTuple):
+    """A point in flight.
+
+    Attributes:
+      margins, speeds: of σ L y, and its derivative.
+      violated: answers of each answerer.
+      time: since the start, radians.
+      last: the wall that was met last.
+      events: walls that were met.
+      kicks: the velocity gained at each wall, in units of its normal and turned back to the start: what it adds there
+        to the position and to the velocity.
+    """
+
+    margins: Float[Array, " c"]
+    speeds: Float[Array, " c"]
+    violated: Float[Array, " a"]
+    time: Float[Array, ""]
+    last: Int[Array, ""]
+    events: Int[Array, ""]
+    kicks: Float[Array, "c 2"]
+
+
+def walls_of(
+    loadings: Float[np.ndarray, "c q"],
+    groups: Sequence[tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]],
+    answerers: Float[np.ndarray, "a c"],
+    *,
+    prior_scale: float,
+) -> Walls:
+    """The walls of answers in padded arrays; `groups` have the rows about one margin each, and their ratios to it."""
+    normals, relieved = prior_scale * loadings, np.zeros(answerers.T.shape)
+    for rows, ratios in groups:
+        relieved[rows[0]] = answerers[:, rows] @ np.sign(ratios)
+    relieved[~np.any(loadings != 0, axis=1)] = 0.0
+    return Walls(*map(jnp.asarray, (normals, normals @ normals.T, relieved)))
+
+
+def flown(
+    y: Float[Array, " q"],
+    velocity: Float[Array, " q"],
+    walls: Walls,
+    *,
+    margins: Float[Array, " c"],
+    violated: Float[Array, " a"],
+    heights: Float[Array, "a n"],
+    duration: float = DURATION,
+) -> tuple[Float[Array, " q"], Float[Array, " q"], Bool[Array, ""]]:
+    """Position and velocity at the end of a flight, and whether it was given up.
+
+    Args:
+      y, velocity: at the start, whitened by the prior.
+      walls: where the likelihood jumps.
+      margins: at the start.
+      violated: answers of each answerer at the start.
+      heights: log likelihood of so many violated answers, for each answerer.
+      duration: in (0, π), radians.
+    """
+    number, squares = len(walls.normals), jnp.diagonal(walls.products)
+    there, each = jnp.any(walls.relieved != 0, axis=1) & (squares > 0), jnp.arange(len(heights))
+
+    def to_next_wall(now: _Flight) -> _Flight:
+        # t cos s + u sin s is zero where cot s = −u/t: the next wall is that of the largest
+        cotangents = jnp.where(there & (jnp.arange(number) != now.last), -now.speeds / now.margins, -jnp.inf)
+        # two reductions, because the compiler makes a slow loop of argmax
+        wall = jnp.min(jnp.where(cotangents == jnp.max(cotangents), jnp.arange(number), number - 1))
+        angle = jnp.arctan2(1.0, cotangents[wall])
+        met = angle < duration - now.time
+        angle = jnp.where(met, angle, duration - now.time)
+        time = jnp.where(met, now.time + angle, duration)
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        speed = now.speeds[wall] * cos - now.margins[wall] * sin
+        beyond = now.violated - jnp.sign(speed) * walls.relieved[wall]
+        gain = jnp.sum(heights[each, beyond.astype(int)] - heights[each, now.violated.astype(int)])
+        square = speed**2 + 2 * squares[wall] * gain
+        through = square > 0
+        after = jnp.where(through, jnp.sign(speed) * jnp.sqrt(jnp.maximum(square, 0)), -speed)
+        kick = jnp.where(met, (after - speed) / squares[wall], 0.0)
+        return _Flight(
+            now.margins * cos + now.speeds * sin,
+            now.speeds * cos - now.margins * sin + kick * walls.products[wall],
+            jnp.where(met & through, beyond, now.violated),
+            time,
+            jnp.where(met, wall, now.last),
+            now.events + met,
+            now.kicks.at[wall].add(kick * jnp.stack([-jnp.sin(time), jnp.cos(time)])),
+        )
+
+    zero = jnp.zeros((), int)
+    kicks = jnp.zeros((number, 2), y.dtype)
+    start = _Flight(margins, walls.normals @ velocity, violated, jnp.zeros((), y.dtype), zero - 1, zero, kicks)
+    most = MOST_EVENTS * number
+    end = lax.while_loop(lambda now: (now.time < duration) & (now.events < most), to_next_wall, start)
+    position, velocity = jnp.stack([y, velocity]) + end.kicks.T @ walls.normals
+    cos, sin = np.cos(duration), np.sin(duration)
+    return position * cos + velocity * sin, velocity * cos - position * sin, end.time < duration
+
+
+def flight_move(
+    key: PRNGKeyArray,
+    y: Float[Array, " q"],
+    walls: Walls,
+    *,
+    margins: Float[Array, " c"],
+    violated: Float[Array, " a"],
+    heights: Float[Array, "a n"],
+    log_likelihood: Callable[[Float[Array, " c"]], Float[Array, ""]],
+) -> tuple[Float[Array, " q"], Float[Array, " c"], Bool[Array, ""]]:
+    """y and its margins after one flight with a fresh velocity, and whether that was given up; arguments as of `flown`.
+
+    The flight conserves prior × velocities × `heights`, and volumes; the test makes of it the law of `log_likelihood`,
+    a function of the margins.
+    """
+    key_velocity, key_test = random.split(key)
+    velocity = random.normal(key_velocity, y.shape, dtype=y.dtype)
+    end, at_end, given_up = flown(y, velocity, walls, margins=margins, violated=violated, heights=heights)
+    then = walls.normals @ end
+
+    def energy(y: Float[Array, " q"], velocity: Float[Array, " q"], margins: Float[Array, " c"]) -> Float[Array, ""]:
+        return 0.5 * jnp.sum(y**2) + 0.5 * jnp.sum(velocity**2) - log_likelihood(margins)
+
+    lost = energy(y, velocity, margins) - energy(end, at_end, then)
+    accepted = (jnp.log(random.uniform(key_test, dtype=y.dtype)) < lost) & ~given_up
+    return jnp.where(accepted, end, y), jnp.where(accepted, then, margins), given_up

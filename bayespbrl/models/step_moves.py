@@ -1,0 +1,144 @@
+"""Moves of weights and lapse rates where the likelihood has steps and there are many answers."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, random
+from jax.scipy.special import logsumexp
+from jaxtyping import Bool, Float, PRNGKeyArray
+
+from bayespbrl.models.expectation_propagation import same_margins
+from bayespbrl.models.gaussian_fit import GaussianFit
+from bayespbrl.models.gibbs import (
+    JointProblem,
+    Point,
+    Unknowns,
+    at_setting,
+    likelihood_with,
+    log_probabilities,
+    point_of,
+)
+from bayespbrl.models.lapse_transport import Ladder, ladder_of, transported
+from bayespbrl.models.likelihoods import log_prob
+from bayespbrl.models.refraction import Walls, flight_move, walls_of
+
+# Dimensions from which few answers decide about each, so that the lapse rate takes the weights along.
+MANY_DIMENSIONS = 64
+BESIDE = 1e-300  # a margin on one side of the step
+
+
+class Steps(NamedTuple):
+    """What the moves need beside the joint problem.
+
+    Attributes:
+      walls: of each setting, stacked.
+      heights: log likelihood of so many violated answers of each answerer, whatever their lapse rate.
+      ladder: of each setting, stacked; None: lapse rates move alone.
+    """
+
+    walls: Walls
+    heights: Float[Array, "a n"]
+    ladder: Ladder | None
+
+
+def steps_of(fits: Sequence[GaussianFit], problem: JointProblem) -> Steps:
+    """Walls and ladders of all settings."""
+    loadings, answerers = np.asarray(problem.settings.loadings), np.asarray(problem.answerers)
+    scale = fits[0].model.prior_scale
+    groups = [same_margins(fit.factors.loadings) for fit in fits]
+    walls = [walls_of(rows, same, answerers, prior_scale=scale) for rows, same in zip(loadings, groups, strict=True)]
+    moving = len(problem.lapse_rate.values) > 1 and loadings.shape[2] > MANY_DIMENSIONS
+    ranks = [fit.factors.loadings.shape[1] for fit in fits] if moving else []
+    ladders = [ladder_of(scale * rows, rank) for rows, rank in zip(loadings, ranks, strict=False)]
+    return Steps(_stacked(walls), _heights(problem), _stacked(ladders) if moving else None)
+
+
+def step_moves(
+    key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem, steps: Steps
+) -> tuple[Float[Array, " q"], Float[Array, " c"], Unknowns, Bool[Array, ""]]:
+    """One flight, lapse rates drawn after it and then with the weights.
+
+    Returns:
+      the weights, their margins, the unknowns, and whether the flight was given up.
+    """
+    keys, y = random.split(key, 3), z / problem.settings.prior_scale
+    walls = at_setting(steps.walls, unknowns.setting)
+    margins = walls.normals @ y
+
+    def lapse_weights(margins: Float[Array, " c"]) -> Float[Array, "a v"]:
+        every = point_of(problem, unknowns)._replace(lapse_rate=problem.lapse_rate.values[:, None])
+        return problem.answerers @ log_probabilities(problem, every, margins).T + problem.lapse_rate.log_probabilities
+
+    y, margins, given_up = flight_move(
+        keys[0],
+        y,
+        walls,
+        margins=margins,
+        violated=problem.answerers @ (margins < 0),
+        heights=steps.heights,
+        log_likelihood=lambda margins: jnp.sum(logsumexp(lapse_weights(margins), axis=1)),
+    )
+    if len(problem.lapse_rate.values) > 1:
+        unknowns = unknowns._replace(lapse_rate=random.categorical(keys[1], lapse_weights(margins)))
+    if steps.ladder is not None:
+        ladder = at_setting(steps.ladder, unknowns.setting)
+        y, margins, unknowns = _transport_move(keys[2], y, margins, unknowns, problem, walls, ladder)
+    return y * problem.settings.prior_scale, margins, unknowns, given_up
+
+
+def _transport_move(
+    key: PRNGKeyArray,
+    y: Float[Array, " q"],
+    margins: Float[Array, " c"],
+    unknowns: Unknowns,
+    problem: JointProblem,
+    walls: Walls,
+    ladder: Ladder,
+) -> tuple[Float[Array, " q"], Float[Array, " c"], Unknowns]:
+    """The lapse rate of one answerer drawn anew with the quantiles of the weights kept."""
+    key_who, key_value = random.split(key)
+    rates = problem.lapse_rate.values
+    who = random.randint(key_who, (), 0, len(problem.answerers))
+    now = point_of(problem, unknowns)
+    every = now._replace(lapse_rate=jnp.where(problem.answerers[who] > 0, rates[:, None], now.lapse_rate))
+    points, log_p = transported(
+        y,
+        ladder,
+        now=_beside(problem, now)[:, ladder.pivots],
+        then=_beside(problem, every)[..., ladder.pivots],
+    )
+    before = unknowns.lapse_rate[who]
+    points = points.at[before].set(y)  # as it is, and not as it comes back from its quantiles
+    each = (points @ walls.normals.T).at[before].set(margins)
+    log_p += jnp.sum(log_probabilities(problem, every, each), axis=-1)
+    log_p += problem.lapse_rate.log_probabilities
+    chosen = random.categorical(key_value, jnp.where(jnp.isfinite(log_p), log_p, -jnp.inf))
+    return points[chosen], each[chosen], unknowns._replace(lapse_rate=unknowns.lapse_rate.at[who].set(chosen))
+
+
+def _beside(problem: JointProblem, point: Point) -> Float[Array, "2 *b c"]:
+    """The probability of each answer where its margin is just positive, and where it is just negative."""
+    likelihood = likelihood_with(problem.settings.likelihood, point)
+    shape = jnp.broadcast_shapes(jnp.shape(point.lapse_rate), (problem.answerers.shape[1],))
+    return jnp.exp(jnp.stack([log_prob(likelihood, jnp.full(shape, sign * BESIDE)) for sign in (1, -1)]))
+
+
+def _heights(problem: JointProblem) -> Float[Array, "a n"]:
+    """Log likelihood of each number of violated answers of each answerer, all margins near zero, without lapse rate."""
+    rates = problem.lapse_rate.values
+    point = Point(
+        problem.steepness.values[0], rates, problem.tie_threshold.values[0]
+    )  # half at zero with any steepness
+    likelihood = likelihood_with(problem.settings.likelihood, point)
+    right, wrong = (log_prob(likelihood, jnp.full(rates.shape, sign * BESIDE)) for sign in (1, -1))
+    given, violated = jnp.sum(problem.answerers, axis=1), jnp.arange(problem.answerers.shape[1] + 1)
+    obeyed = given[:, None] - violated
+    log_p = obeyed[..., None] * right + violated[:, None] * wrong + problem.lapse_rate.log_probabilities
+    return logsumexp(log_p, axis=-1)
+
+
+def _stacked(parts: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *arrays: jnp.stack(arrays), *parts)
