@@ -116,7 +116,7 @@ class Chains:
         no = zeros.astype(bool)
         keys = jax.random.split(jax.random.key(seed), num_chains)
         state = EllipticalSliceState({"utility_weights": start}, zeros, zeros, no, no, keys)
-        steps = steps_of(fits, problem) if _flies(problem) else None
+        steps = steps_of(fits, problem) if _flies(problem.settings) else None
         return cls(problem, state, unknowns, chunk, rank, len(fits[0].differences), steps)
 
     @property
@@ -223,12 +223,20 @@ def _with_reference(fit: GaussianFit, rank: int, power: float = REFERENCE_POWER)
     )
 
 
+def _flies(problem: PreferenceProblem) -> bool:
+    """Whether the weights move by flights too: many answers, and one step each."""
+    steps = has_steps(problem.likelihood) and not isinstance(problem.likelihood, WithTies)
+    return problem.loadings.shape[-2] > FEW and steps
+
+
 def _ellipses(model_args: Args, model_kwargs: Keywords, *, sweeps: int = 1) -> list[tuple[Ellipse, int]]:
     (problem,) = model_args
     capacity, rank = problem.loadings.shape
     if capacity > FEW:
         if not has_steps(problem.likelihood):
             return [(reference_ellipse(problem), SMOOTH_MOVES), (prior_ellipse(problem), 1)]
+        if _flies(problem):
+            return [(prior_ellipse(problem), 1)]
         axes = [(axis_ellipse(problem), rank)] if rank > LOW_DIMENSION else []
         return [*axes, (reference_ellipse(problem), STEP_MOVES), (prior_ellipse(problem), 1)]
     return [
@@ -247,12 +255,6 @@ KERNEL, KERNEL_OF_SWEEP = (
     EllipticalSlice(low_rank_model, batch=8, ellipses=partial(_ellipses, sweeps=sweeps), log_likelihood=_log_likelihood)
     for sweeps in (1, SWEEPS)
 )
-
-
-def _flies(problem: JointProblem) -> bool:
-    """Whether the weights move by flights: many answers, and one step each."""
-    likelihood = problem.settings.likelihood
-    return problem.settings.loadings.shape[1] > FEW and has_steps(likelihood) and not isinstance(likelihood, WithTies)
 
 
 def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem) -> Recorded:
@@ -284,16 +286,14 @@ def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem)
 
 
 def flight_draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem, steps: Steps) -> Recorded:
-    """As `draw`, by flights; a flight that is given up counts as stuck."""
+    """As `draw`, with a flight in each draw; one that is given up counts as stuck."""
     key, *keys = random.split(state.rng_key, 3)
     z, unknowns = moved(keys[0], state.z["utility_weights"], unknowns, problem)
-    z, margins, unknowns, given_up = step_moves(keys[1], z, unknowns, problem, steps)
+    z, unknowns, given_up = step_moves(keys[1], z, unknowns, problem, steps)
     one = conditional(problem, unknowns)
-    log_p = total_log_prob(one.likelihood, margins, one.used)
-    state = EllipticalSliceState(
-        {"utility_weights": z}, log_p, jnp.ones_like(state.candidates), given_up, ~jnp.isfinite(log_p), key
-    )
-    return state, unknowns, log_prob(one.likelihood, margins)
+    state = KERNEL.sample(state._replace(z={"utility_weights": z}, rng_key=key), (one,), {})
+    state = state._replace(stuck=state.stuck | given_up)
+    return state, unknowns, log_prob(one.likelihood, one.loadings @ state.z["utility_weights"])
 
 
 # Level 1 compiles faster, and a loop over small vectors runs as fast.

@@ -91,8 +91,7 @@ def sample_posterior(
         steepness (chain, draw); lapse_rate (chain, draw, answerer); tie_threshold (chain, draw) where there are ties;
         side_bias (chain, draw) where `shown_first` is known, with a dimension answerer where `answerers` are; and
         utility_weights (chain, draw, feature), those of the draw's setting; the last two are computed when indexed;
-      `sample_stats`: lp (log likelihood), candidates (per move; 1 where a move is a flight), stuck, diverging (a
-        likelihood of zero or NaN);
+      `sample_stats`: lp (log likelihood), candidates (per move), stuck, diverging (a likelihood of zero or NaN);
       `log_likelihood`: answers (chain, draw, preference); `observed_data`: answers, 1 as given and 0 for a tie;
       `constant_data`: differences, with a dimension `setting` in front where they had one; shown_first, answerers;
       at the root: utility_weights_mean (feature), whose part outside the differences' row space is exactly zero;

@@ -63,7 +63,7 @@ class _Flight(NamedTuple):
 
 def walls_of(
     loadings: Float[np.ndarray, "c q"],
-    groups: Sequence[tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]],
+    groups: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, " _"]]],
     answerers: Float[np.ndarray, "a c"],
     *,
     prior_scale: float,

@@ -58,11 +58,11 @@ def steps_of(fits: Sequence[GaussianFit], problem: JointProblem) -> Steps:
 
 def step_moves(
     key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem, steps: Steps
-) -> tuple[Float[Array, " q"], Float[Array, " c"], Unknowns, Bool[Array, ""]]:
+) -> tuple[Float[Array, " q"], Unknowns, Bool[Array, ""]]:
     """One flight, lapse rates drawn after it and then with the weights.
 
     Returns:
-      the weights, their margins, the unknowns, and whether the flight was given up.
+      the weights, the unknowns, and whether the flight was given up.
     """
     keys, y = random.split(key, 3), z / problem.settings.prior_scale
     walls = at_setting(steps.walls, unknowns.setting)
@@ -85,8 +85,8 @@ def step_moves(
         unknowns = unknowns._replace(lapse_rate=random.categorical(keys[1], lapse_weights(margins)))
     if steps.ladder is not None:
         ladder = at_setting(steps.ladder, unknowns.setting)
-        y, margins, unknowns = _transport_move(keys[2], y, margins, unknowns, problem, walls, ladder)
-    return y * problem.settings.prior_scale, margins, unknowns, given_up
+        y, unknowns = _transport_move(keys[2], y, margins, unknowns, problem, walls, ladder)
+    return y * problem.settings.prior_scale, unknowns, given_up
 
 
 def _transport_move(
@@ -97,7 +97,7 @@ def _transport_move(
     problem: JointProblem,
     walls: Walls,
     ladder: Ladder,
-) -> tuple[Float[Array, " q"], Float[Array, " c"], Unknowns]:
+) -> tuple[Float[Array, " q"], Unknowns]:
     """The lapse rate of one answerer drawn anew with the quantiles of the weights kept."""
     key_who, key_value = random.split(key)
     rates = problem.lapse_rate.values
@@ -116,7 +116,7 @@ def _transport_move(
     log_p += jnp.sum(log_probabilities(problem, every, each), axis=-1)
     log_p += problem.lapse_rate.log_probabilities
     chosen = random.categorical(key_value, jnp.where(jnp.isfinite(log_p), log_p, -jnp.inf))
-    return points[chosen], each[chosen], unknowns._replace(lapse_rate=unknowns.lapse_rate.at[who].set(chosen))
+    return points[chosen], unknowns._replace(lapse_rate=unknowns.lapse_rate.at[who].set(chosen))
 
 
 def _beside(problem: JointProblem, point: Point) -> Float[Array, "2 *b c"]:
