@@ -44,8 +44,8 @@ ENVIRONMENTS, RUNS = ROOT / ".venv-neighbours", ROOT / "runs" / "neighbours"
 RESULTS = Path(__file__).parent / "results" / "neighbours.csv"
 TASKS = ("CartPole-v1", "Pendulum-v1", "MountainCarContinuous-v0", "Acrobot-v1", "MountainCar-v0")
 METHODS = {"bayespbrl": "bayespbrl", "posterior-ppo": "bayespbrl", "imitation": "imitation"}  # and their environments
-FIGURES = ["answered", "value", "steps", "cpu_seconds"]
-COLUMNS = ["task", "answers", "seed", "method", *FIGURES]
+FIGURES = {"answered": int, "value": float, "steps": int, "cpu_seconds": float}
+COLUMNS: dict[str, type] = {"task": str, "answers": int, "seed": int, "method": str, **FIGURES}
 EPISODES, COPIES = 100, 8
 # of the notebook "Learning a Reward Function using Preference Comparisons" of imitation 1.0.1, by name of the argument
 PPO_SETTINGS = {"n_steps": 2048 // COPIES, "batch_size": 64, "n_epochs": 10, "learning_rate": 2e-3}
@@ -253,7 +253,7 @@ def done(file: Path) -> list[dict[str, Any]]:
         return []
     with file.open() as lines:
         rows = [row for row in csv.DictReader(lines) if all(row.get(name) not in (None, "") for name in COLUMNS)]
-    return [{name: Cell.__annotations__.get(name, float)(row[name]) for name in COLUMNS} for row in rows]
+    return [{name: kind(row[name]) for name, kind in COLUMNS.items()} for row in rows]
 
 
 def run(cells: Sequence[Cell], file: Path, measure: Callable[[Cell], dict[str, Any]] = measured) -> list[Cell]:
