@@ -5,6 +5,7 @@ import importlib
 import os
 import shutil
 from collections import Counter
+from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
 
@@ -75,9 +76,10 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
 os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
 os.environ["PYTHONWARNINGS"] = "ignore:Error reading persistent compilation cache entry"
-# Compilation is most of the work of a first session: the older of two generators of code takes half as long.
+# Compilation is most of the work of a first session: the older of two generators of code takes half as long. XLA ends
+# the process where it does not know an option, so only the versions that were tried get it.
 COMPILER = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-if COMPILER not in os.environ.get("XLA_FLAGS", ""):
+if version("jaxlib").startswith("0.10.") and COMPILER not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {COMPILER}".strip()
 
 QUICK = {"preset": "paper", "max_steps": 20, "evaluation_episodes": 3}

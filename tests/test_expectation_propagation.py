@@ -4,7 +4,7 @@ import pytest
 from scipy import integrate
 
 from bayespbrl.models import PreferenceModel
-from bayespbrl.models.expectation_propagation import expectation_propagation, tilted_moments
+from bayespbrl.models.expectation_propagation import expectation_propagation, same_margins, tilted_moments
 from bayespbrl.models.likelihoods import (
     Logistic,
     Mixed,
@@ -166,6 +166,16 @@ def test_a_tie_far_from_zero_has_finite_moments_that_mirror_each_other(steepness
         np.testing.assert_allclose(above[2], below[2], rtol=1e-6)
         assert 0 <= above[1][0] <= mean + 1e-9
         assert 0 < above[2][0] < 0.02
+
+
+def test_parallel_rows_are_one_group_and_a_row_of_zeros_is_its_own():
+    groups = same_margins(np.array([[1.0, 2.0], [0.0, 0.0], [-2.0, -4.0], [2.0, -1.0], [0.0, 0.0]]))
+    assert [(rows.tolist(), ratios.tolist()) for rows, ratios in groups] == [
+        ([0, 2], [1.0, -2.0]),
+        ([1], [0.0]),
+        ([3], [1.0]),
+        ([4], [0.0]),
+    ]
 
 
 def _tie(steepness, threshold, t):

@@ -136,8 +136,11 @@ def repeated_moments(
 
 def same_margins(
     loadings: Float[np.ndarray, "k r"],
-) -> list[tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]]:
-    """The rows of L in groups that are parallel, in the order of the first of each, and their ratios to it."""
+) -> list[tuple[Int[np.ndarray, " _"], Float[np.ndarray, " _"]]]:
+    """The rows of L in groups that are parallel, in the order of the first of each, and their ratios to it.
+
+    A row of zeros is a group of its own, of ratio 0.
+    """
     tiny = np.finfo(float).tiny
     largest = np.maximum(np.max(np.abs(loadings), axis=1, initial=0.0, keepdims=True), tiny)
     units = loadings / largest  # entries near the smallest numbers have no squares
@@ -150,7 +153,8 @@ def same_margins(
             alike = free & (np.abs(cosines[row]) >= 1 - SAME)
             alike[row] = True
             group = np.flatnonzero(alike)
-            groups.append((group, np.sign(cosines[row, group]) * lengths[group] / lengths[row]))
+            ratios = lengths[group] / max(lengths[row], tiny)  # a row of zeros has none
+            groups.append((group, np.sign(cosines[row, group]) * ratios))
             free[group] = False
     return groups
 
