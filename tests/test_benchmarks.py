@@ -174,6 +174,7 @@ def test_the_index_of_the_results_names_every_file_once_and_nothing_else():
     assert sorted(named) == sorted(path.name for path in results.iterdir() if path.name != "README.md")
 
 
+@pytest.mark.slow
 def test_results_follow_from_the_committed_data_and_a_changed_figure_is_found(tmp_path):
     page = benchmark("results_page")
     studies = page.committed()

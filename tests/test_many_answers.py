@@ -65,6 +65,7 @@ def test_posterior_of_a_hundred_answers_is_that_of_quadrature(name):
     assert tree.attrs["log_evidence"] == pytest.approx(log_evidence, abs=4 * tree.attrs["log_evidence_error"] + 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", [False, True])
 def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterior_of_quadrature(transport, monkeypatch):
     monkeypatch.setattr(step_moves, "MANY_DIMENSIONS", 0 if transport else 2**20)
