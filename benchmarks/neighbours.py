@@ -283,13 +283,13 @@ def _cell(row: dict[str, Any]) -> Cell:
 
 
 def _write(file: Path, rows: list[dict[str, Any]]) -> None:
+    import pandas as pd
+
+    from bayespbrl.runs.files import written_aside
+
     file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_suffix(".partial")
-    with aside.open("w", newline="") as lines:
-        table = csv.DictWriter(lines, COLUMNS)
-        table.writeheader()
-        table.writerows(rows)
-    aside.replace(file)
+    with written_aside(file) as aside:
+        pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(aside, index=False, lineterminator="\r\n")
 
 
 def table(rows: Sequence[dict[str, Any]]) -> list[str]:

@@ -24,12 +24,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from scipy import stats
 from scipy.special import expit
 
 from bayespbrl.diagnostics import answer_probabilities
 from bayespbrl.models import Answers, PreferenceModel, posterior_draws, priors
+from bayespbrl.runs.files import written_aside
 
 ANSWERS, HELD_OUT, DIMENSION = 40, 200, 5
 STEEPNESS, THRESHOLD, BIAS_NATS, LAPSE_RATES = 5.0, 1 / 3, 0.5, (0.0, 0.4)
@@ -165,12 +167,8 @@ def run(seeds: Sequence[int], file: Path, *, drawn: bool = False) -> list[dict[s
 
 def _write(file: Path, rows: list[dict[str, float]]) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_suffix(".partial")
-    with aside.open("w", newline="") as lines:
-        table = csv.DictWriter(lines, COLUMNS)
-        table.writeheader()
-        table.writerows(rows)
-    aside.replace(file)
+    with written_aside(file) as aside:
+        pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(aside, index=False, lineterminator="\r\n")
 
 
 def show(rows: Sequence[dict[str, float]]) -> None:
