@@ -48,17 +48,20 @@ class RadialBasis:
       period: infinite where not periodic.
       normalised: whether φ is divided by its sum. A linear function of it then keeps the value of the nearest centres
         beyond them, where plain radial basis functions fall to zero.
+      constant: value of one more feature, the last, which is the same for all states; 0: there is none.
     """
 
     centres: Float[np.ndarray, "d s"]
     bandwidths: Float[np.ndarray, " s"]
     period: Float[np.ndarray, " s"]
     normalised: bool = False
+    constant: float = 0.0
 
     def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Features of N observations, shape (N, S)."""
         observations = matrix("observations", observations, columns=self.centres.shape[1])
-        return radial_basis(observations, self.centres, self.bandwidths, self.period, normalised=self.normalised)
+        basis = radial_basis(observations, self.centres, self.bandwidths, self.period, normalised=self.normalised)
+        return np.pad(basis, ((0, 0), (0, 1)), constant_values=self.constant) if self.constant else basis
 
     def rescaled(self, multiples: ArrayLike) -> Self:
         """The same centres with bandwidths `multiples` times as wide, one number or one a dimension."""
@@ -67,7 +70,10 @@ class RadialBasis:
     def under(
         self, multiples: Float[np.ndarray, "c s"], observations: ArrayLike
     ) -> Iterator[tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]]:
-        """`rescaled(row)(observations)` for each row of `multiples` in turn, as of `radial_basis_under`."""
+        """`rescaled(row)(observations)` for each row of `multiples` in turn, as of `radial_basis_under`.
+
+        The constant feature is not among them.
+        """
         points = matrix("observations", observations, columns=self.centres.shape[1])
         return radial_basis_under(
             multiples, points, self.centres, self.bandwidths, self.period, normalised=self.normalised
@@ -134,12 +140,15 @@ class RadialBasisOptions:
       bandwidth_factor: multiplies the median rule.
       period: of each observation dimension, infinite where not periodic; None for none.
       normalised: as of `RadialBasis`; for φ(s) alone.
+      constant: whether φ(s) has a constant feature too, which gives the utility of a state as much prior variance as
+        the others give it in the mean. Then how long a trajectory is counts by itself.
     """
 
     centres: int
     bandwidth_factor: float = 1.0
     period: ArrayLike | None = None
     normalised: bool = False
+    constant: bool = False
 
     def __post_init__(self) -> None:
         whole("centres", self.centres)
@@ -169,7 +178,11 @@ def draw_state_features(
     if isinstance(observation_space, Discrete):
         return OneHot(int(observation_space.n))
     states = matrix("states", states, columns=_box("observation_space", observation_space).shape[0])
-    return options.state_kernel(states, rng)[0]
+    kernel = options.state_kernel(states, rng)[0]
+    if not options.constant:
+        return kernel
+    variances = np.sum(kernel(kernel.centres) ** 2, axis=1)  # the centres are a sample of the states
+    return replace(kernel, constant=float(np.sqrt(np.mean(variances))))
 
 
 def draw_state_action_features(
@@ -230,10 +243,15 @@ class FeatureSource:
     def of_states(
         self, trajectories: Sequence[Trajectory], options: RadialBasisOptions, *, rng: np.random.Generator
     ) -> StateFeatures:
-        """φ(s), the user's or drawn at all states of the trajectories."""
+        """φ(s), the user's or drawn at all states of the trajectories.
+
+        Where none of them ended before the time limit, all are equally long, and there is no constant feature.
+        """
         if self.own is not None:
             own = self.own
             return lambda states: checked_features(own, states)
+        if not any(trajectory.terminated for trajectory in trajectories):
+            options = replace(options, constant=False)
         observed = np.concatenate([trajectory.states for trajectory in trajectories])
         return draw_state_features(self.observation_space, observed, self._periodic(options), rng=rng)
 

@@ -9,6 +9,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.features import (
+    FeatureSource,
     JointRadialBasis,
     OneHot,
     RadialBasis,
@@ -20,6 +21,7 @@ from bayespbrl.features import (
 )
 from bayespbrl.kernels import median_bandwidths, radial_basis_row
 from bayespbrl.trajectories import Trajectory, trajectory_features
+from bayespbrl.utility import infer_utility
 from bayespbrl.utility.length_scales import settings, sums_under, values_under
 
 PERIOD = (2 * np.pi, np.inf)
@@ -86,6 +88,28 @@ def test_normalised_functions_are_the_plain_ones_over_their_sum_and_go_on_beyond
     expected = np.eye(7)[[np.argmax(plain.centres[:, 0]), np.argmin(plain.centres[:, 0])]]
     np.testing.assert_allclose(normalised(far), expected, atol=1e-12)
     assert normalised.rescaled(2.0).normalised
+
+
+def test_a_constant_feature_has_the_variance_of_the_others_where_lengths_differ():
+    rng = np.random.default_rng(1)
+    options, source = RadialBasisOptions(8, normalised=True, constant=True), FeatureSource(STATES, TORQUE)
+
+    def walk(length, terminated):
+        return Trajectory(rng.normal(size=(length + 1, 2)), np.zeros((length, 1)), np.zeros(length), terminated)
+
+    assert source.of_states([walk(30, False)] * 2, options, rng=rng).constant == 0
+    features = source.of_states([walk(30, False), walk(12, True)], options, rng=rng)
+    others = replace(features, constant=0.0)
+    columns = features.rescaled(3.0)(walk(30, False).states)
+    np.testing.assert_array_equal(columns[:, 8], features.constant)
+    np.testing.assert_allclose(features.constant**2, np.mean(np.sum(others(features.centres) ** 2, axis=1)))
+    # preferring the longer one each time says of two never seen that the longer is better
+    lengths = np.array([5, 20, 40, 60])
+    walks = [walk(length, True) for length in lengths]
+    sums = trajectory_features(walks, features, discount=1.0)
+    utility = infer_utility(sums, [(3, 2), (2, 1), (1, 0)], features=features, discount=1.0)
+    longer, shorter = walk(80, False), walk(10, True)
+    assert np.mean(utility.margin_draws(longer, shorter) > 0) > 0.95
 
 
 def test_the_traceable_row_equals_the_matrix():
@@ -261,18 +285,18 @@ def test_bad_input_is_named(call, message):
         call(np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("normalised", [False, True])
+@pytest.mark.parametrize(("normalised", "constant"), [(False, 0.0), (True, 0.0), (True, 0.3)])
 @pytest.mark.parametrize("dimensions", [1, 3, 5])
-def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, dimensions):
+def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, constant, dimensions):
     rng = np.random.default_rng(dimensions)
     period, bandwidths = np.full(dimensions, np.inf), rng.uniform(0.3, 2.0, dimensions)
     period[dimensions // 2], bandwidths[-1] = 2.0, 0.0  # one dimension is a circle, one is left out
     bandwidths[0] = 0.7
-    features = RadialBasis(rng.normal(size=(20, dimensions)), bandwidths, period, normalised)
+    features = RadialBasis(rng.normal(size=(20, dimensions)), bandwidths, period, normalised, constant)
     states = rng.normal(size=(300, dimensions))
     states[:2] *= 1e4  # far from all centres, where every exponential is zero
     multiples = settings(features, inferred=True, rng=rng)
-    weights = [rng.normal(size=(20, 1 + number % 3)) for number in range(len(multiples))]
+    weights = [rng.normal(size=(20 + (constant > 0), 1 + number % 3)) for number in range(len(multiples))]
     values = values_under(features, multiples, states, weights)
     path = Trajectory(states, np.zeros((299, 1)), np.zeros(299), False)
     sums = sums_under(features, multiples, [path, path], discount=0.9)

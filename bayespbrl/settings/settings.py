@@ -36,6 +36,8 @@ class Features:
       utility_bandwidth_factor: multiplies the median rule for the utility's features.
       normalised_utility: whether the utility's radial basis functions are divided by their sum. Decision: they are, so
         that the utility extends to states far from every compared trajectory, where plain ones fall to zero.
+      constant_utility: whether the utility has a constant part, as of `RadialBasisOptions`, where some episodes end
+        before the time limit.
     """
 
     features: str = "drawn"
@@ -43,14 +45,16 @@ class Features:
     bandwidth_factor: float = 1.0
     utility_bandwidth_factor: float = 1.0
     normalised_utility: bool = True
+    constant_utility: bool = False
 
     def __post_init__(self) -> None:
         checks.one_of("features", self.features, ("drawn", "other"))
         checks.whole("centres", self.centres)
         checks.positive("bandwidth_factor", self.bandwidth_factor)
         checks.positive("utility_bandwidth_factor", self.utility_bandwidth_factor)
-        if not isinstance(self.normalised_utility, bool):
-            raise ValueError(f"normalised_utility: expected true or false, got {self.normalised_utility!r}")
+        for name in ("normalised_utility", "constant_utility"):
+            if not isinstance(value := getattr(self, name), bool):
+                raise ValueError(f"{name}: expected true or false, got {value!r}")
 
     @property
     def of_critic(self) -> RadialBasisOptions:
@@ -60,7 +64,12 @@ class Features:
     @property
     def of_utility(self) -> RadialBasisOptions:
         """Those of the utility."""
-        return RadialBasisOptions(self.centres, self.utility_bandwidth_factor, normalised=self.normalised_utility)
+        return RadialBasisOptions(
+            self.centres,
+            self.utility_bandwidth_factor,
+            normalised=self.normalised_utility,
+            constant=self.constant_utility,
+        )
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,8 @@ def infer_utility(
     if method == "linear-program":
         return _by_linear_program(sums, comparisons, chosen)
     model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold)
-    return _by_posterior([sums], np.ones((1, 0)), comparisons, chosen, method, model, seed)
+    unscaled = settings(chosen, inferred=False, rng=np.random.default_rng(0))
+    return _by_posterior([sums], unscaled, comparisons, chosen, method, model, seed)
 
 
 def _by_linear_program(

@@ -54,7 +54,9 @@ def values_under(
     for start in range(0, len(states), ROWS_AT_A_TIME):
         rows = slice(start, start + ROWS_AT_A_TIME)
         for number, (kernel, shares) in enumerate(features.under(multiples, states[rows])):
-            values[number][rows] = shares[:, None] * (kernel @ weights[number])
+            values[number][rows] = shares[:, None] * (kernel @ weights[number][: kernel.shape[1]])
+            if features.constant:
+                values[number][rows] += features.constant * weights[number][-1]
     return values
 
 
@@ -68,11 +70,13 @@ def sums_under(
     """ψ(τ) of n trajectories under each of C settings, as `trajectory_features`."""
     if not isinstance(features, RadialBasis) or len(multiples) == 1:
         return [trajectory_features(trajectories, rescaled(features, row), discount=discount) for row in multiples]
-    sums = np.zeros((len(multiples), len(trajectories), len(features.centres)))
+    functions = len(features.centres)
+    sums = np.zeros((len(multiples), len(trajectories), functions + bool(features.constant)))
     for i, trajectory in enumerate(trajectories):
         discounts = discount ** np.arange(len(trajectory))
+        sums[:, i, functions:] = features.constant * discounts.sum()
         for start in range(0, len(trajectory), ROWS_AT_A_TIME):
             rows = slice(start, start + ROWS_AT_A_TIME)
             for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):
-                sums[number, i] += (discounts[rows] * shares) @ kernel  # eq. 1
+                sums[number, i, :functions] += (discounts[rows] * shares) @ kernel  # eq. 1
     return list(sums)
