@@ -15,6 +15,7 @@ import bayespbrl
 from bayespbrl import Learner, ReturnExpert, rollouts
 from bayespbrl.policies.actor import Actor
 from bayespbrl.rollouts import rollout
+from bayespbrl.runs.files import write_netcdf
 
 FAST = {"max_steps": 8, "evaluation_episodes": 4, "centres": 20, "seed": 3, "hyperparameters": "given"}
 
@@ -79,7 +80,7 @@ def test_a_policy_is_tried_without_its_noise_from_starts_that_all_policies_share
 
 @pytest.mark.slow
 def test_undo_takes_back_which_policies_were_tried_and_kept():
-    straight, undone = (Learner(Slope(), answers=3, **FAST) for _ in range(2))
+    straight, undone = (Learner(Slope(), answers=3, iterations=4, **FAST) for _ in range(2))
     straight.run(ReturnExpert())
     while questions := undone.ask():
         undone.tell(["tie"])
@@ -133,9 +134,9 @@ def test_a_run_of_an_earlier_version_which_tried_no_policy_goes_on(run, tmp_path
     """Its kept policy stays the same, with its noise, until it is continued."""
     directory = shutil.copytree(run.path, tmp_path / "old")
     for file in (directory / "iterations").iterdir():
-        with xr.open_datatree(file, engine="h5netcdf", decode_times=False) as tree:
+        with xr.open_datatree(file, engine="netcdf4", decode_times=False) as tree:
             old = tree.load()
-        old.drop_nodes("tried").to_netcdf(file, engine="h5netcdf")
+        write_netcdf(file, old.drop_nodes("tried"))
     lines = [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]
     last = max(number for number, line in enumerate(lines) if line["event"] == "collected")
     for line in lines:
@@ -180,7 +181,7 @@ def test_an_environment_that_no_seed_resets_is_compared_across_starts():
 
 @pytest.mark.slow
 def test_a_stopped_run_of_the_default_goes_on_bit_for_bit(tmp_path):
-    options = {"answers": 3, "same_start": True, **FAST, "hyperparameters": "inferred"}
+    options = {"answers": 3, "same_start": True, "iterations": 4, **FAST, "hyperparameters": "inferred"}
     whole = Learner("swing-up", **options).run(ReturnExpert())
     stopped, expert = bayespbrl.start("swing-up", tmp_path / "run", **options), ReturnExpert()
     for _ in range(2):

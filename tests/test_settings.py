@@ -47,6 +47,7 @@ BAD = {
     "hyperparameters": ["chosen", None],
     "utility_bandwidth_factor": [0, -1.0, NAN],
     "normalised_utility": [None, 1, "yes"],
+    "constant_utility": [None, 1, "yes"],
     "preset": ["fast", "", None],
     "answers": [0, -1, 2.5, True],
     "same_start": [None, 1, "yes"],

@@ -73,7 +73,8 @@ PAPER["Pendulum-v1"] = PAPER["swing-up"] | {
     "projection_ridge": 1e-8,
 }
 
-# The four tasks under the default: what their rows say of features and exploration; the rest is as for any task.
+# The four tasks under the default: what their rows say of features and exploration, and as many checks as their figures
+# were measured with; the rest is as for any task.
 KEPT = (
     "discount",
     "trajectory_discount",
@@ -87,8 +88,8 @@ KEPT = (
 )
 TASKS = {
     task: {name: PAPER[task][name] for name in KEPT if name in PAPER[task]}
-    | {"updates_per_iteration": 3, "trajectories_per_iteration": 10}
-    for task in ("gridworld", "swing-up", "bicycle", "acrobot")
+    | {"updates_per_iteration": 3, "trajectories_per_iteration": 10, "check_episodes": check_episodes}
+    for task, check_episodes in (("gridworld", 40), ("swing-up", 8), ("bicycle", 8), ("acrobot", 40))
 }
 # An environment object of the user's is known by its gymnasium id.
 IDS = {
@@ -105,6 +106,7 @@ DEFAULT: dict[str, Any] = {
     "unasked_iterations": 4,
     "worthwhile": True,
     "checked": True,
+    "constant_utility": True,  # CartPole's answers are foreseen better
     "critic_iterations": 4,  # on the hidden reward Pendulum forgets with all transitions
     "recent_iterations": 4,
     "update_states": 10_000,
@@ -133,8 +135,8 @@ class Task:
     action_space: Space[Any]
     horizon: int
 
-    def derived(self) -> dict[str, Any]:
-        """Options by spaces and horizon.
+    def derived(self, *, people: bool) -> dict[str, Any]:
+        """Options by spaces and horizon, and by whether people answer, who wait.
 
         Decision: Q looks a quarter of the horizon ahead; the noise of continuous actions is held for a fortieth of an
         episode (long for MountainCarContinuous; short for InvertedPendulum, which falls at once); in few dimensions
@@ -148,7 +150,7 @@ class Task:
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
             "trajectories_per_iteration": 10 if continuous else 20,
-            "check_episodes": 8 if continuous else 40,
+            "check_episodes": (8 if people else 32) if continuous else (40 if people else 100),
             "centres": 300 if continuous else 100,
             "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
         }
@@ -168,8 +170,9 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     name = IDS.get(env, env)
     if checks.one_of("preset", chosen.get("preset", "default"), NAMES) == "paper":
         return {"hyperparameters": "given"} | PAPER.get(name, {})
-    options = DEFAULT | ({} if task is None else task.derived()) | TASKS.get(name, {})
-    if chosen.get("expert", "return") not in SIMULATED:
+    people = chosen.get("expert", "return") not in SIMULATED
+    options = DEFAULT | ({} if task is None else task.derived(people=people)) | TASKS.get(name, {})
+    if people:
         options |= PEOPLE
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":
         options["query"] = "highest-utility"
