@@ -29,6 +29,7 @@ from bayespbrl.results.write import section, tables_of
 from bayespbrl.runs.directory import read_summary
 from bayespbrl.studies.baseline_trials import read_baseline
 from bayespbrl.studies.declaration import declared
+from bayespbrl.studies.processes import trial_processes
 from bayespbrl.studies.rows import row_of, run_trial
 
 HERE = Path(__file__).parent
@@ -141,7 +142,8 @@ def differences_of_a_cell(data: StudyData) -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         learner = row_of(row.declared.env, Path(folder) / "row", row.declared.options, seed=seed)
         cell = replace(learner, baseline=row.declared.baseline)
-        run_trial(cell, seed)
+        with trial_processes(1) as process:  # with as many threads as in a study: others round sums otherwise
+            process.submit(run_trial, cell, seed).result()
         again = (read_summary if cell.baseline is None else read_baseline)(cell.path(seed))["iterations"]
     where = f"study {data.name}, {row.declared.name}, seed {seed}"
     if len(again) != len(kept):

@@ -18,20 +18,20 @@ that are missing. At the end it prints how many intervals hold the true value an
 """
 
 import argparse
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import xarray as xr
+from rows_by_seed import run
 from scipy import stats
 from scipy.special import expit
 
 from bayespbrl.diagnostics import answer_probabilities
 from bayespbrl.models import Answers, PreferenceModel, posterior_draws, priors
-from bayespbrl.runs.files import written_aside
+from bayespbrl.results.intervals import failed_trials
 
 ANSWERS, HELD_OUT, DIMENSION = 40, 200, 5
 STEEPNESS, THRESHOLD, BIAS_NATS, LAPSE_RATES = 5.0, 1 / 3, 0.5, (0.0, 0.4)
@@ -145,41 +145,15 @@ def _log_score(tree: xr.DataTree, order: Questions, answers: Answers) -> float:
     return float(np.mean(np.log(probabilities[:, PREFERRED] / probabilities[:, [PREFERRED, DOMINATED]].sum(axis=1))))
 
 
-def done(file: Path) -> list[dict[str, float]]:
-    """The rows so far; a last one that is cut off is dropped."""
-    if not file.exists():
-        return []
-    with file.open() as lines:
-        rows = [row for row in csv.DictReader(lines) if all(row[name] not in (None, "") for name in COLUMNS)]
-    return [{name: float(row[name]) for name in COLUMNS} for row in rows]
-
-
-def run(seeds: Sequence[int], file: Path, *, drawn: bool = False) -> list[dict[str, float]]:
-    """All rows, after the missing runs."""
-    rows = done(file)
-    _write(file, rows)
-    for seed in sorted(set(seeds) - {int(row["seed"]) for row in rows}):
-        rows.append({name: round(value, 5) for name, value in one_run(seed, drawn=drawn).items()})
-        with file.open("a", newline="") as lines:
-            csv.DictWriter(lines, COLUMNS).writerow(rows[-1])
-    return [row for row in rows if int(row["seed"]) in seeds]
-
-
-def _write(file: Path, rows: list[dict[str, float]]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with written_aside(file) as aside:
-        pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(aside, index=False, lineterminator="\r\n")
-
-
 def show(rows: Sequence[dict[str, float]]) -> None:
     """Print coverage and the difference of the log scores."""
     print(f"{len(rows)} runs, {sum(row['converged'] for row in rows):g} converged")
     for name in QUANTITIES:
         held = sum(row[f"{name} lower"] <= row[f"{name} true"] <= row[f"{name} upper"] for row in rows)
-        low, high = stats.binomtest(held, len(rows)).proportion_ci(0.95, method="exact")
+        share = failed_trials(held, len(rows))  # the exact interval of any share
         truth, mean = (np.mean([row[f"{name} {end}"] for row in rows]) for end in ("true", "mean"))
         print(f"{name}: true {truth:.2f}, posterior mean {mean:.2f} (means over the runs); ", end="")
-        print(f"covered {held / len(rows):.3f} [{low:.3f}, {high:.3f}]")
+        print(f"covered {share.estimate:.3f} [{share.low:.3f}, {share.high:.3f}]")
     gain = np.array([row["log score"] - row["log score without"] for row in rows])
     reach = stats.t.ppf(0.975, len(gain) - 1) * gain.std(ddof=1) / np.sqrt(len(gain))
     without = np.mean([row["log score without"] for row in rows])
@@ -194,4 +168,5 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=4000)
     parser.add_argument("--out", type=Path, default=RESULTS)
     chosen = parser.parse_args()
-    show(run(range(chosen.seed, chosen.seed + chosen.runs), chosen.out, drawn=chosen.drawn))
+    seeds = range(chosen.seed, chosen.seed + chosen.runs)
+    show(run(seeds, chosen.out, COLUMNS, partial(one_run, drawn=chosen.drawn)))

@@ -21,6 +21,9 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 CYCLE = BENCHMARKS / "cycle.py"
 
 
+sys.path.append(str(BENCHMARKS))  # where a script looks for what it shares with others
+
+
 def benchmark(name):
     spec = importlib.util.spec_from_file_location(f"benchmark_{name}", BENCHMARKS / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
@@ -241,20 +244,36 @@ def test_a_row_of_an_answer_is_the_preferred_less_the_other_with_its_side():
     assert given.sides.tolist() == [1, -1, 1]
 
 
-@pytest.mark.slow
-def test_the_study_of_simulated_people_goes_on_where_it_was_cut(tmp_path, capsys, monkeypatch):
-    study, file = benchmark("simulated_people"), tmp_path / "rows.csv"
-    monkeypatch.setattr(study, "ANSWERS", 10)
-    (first,) = study.run([5], file)
+def test_rows_by_seed_go_on_where_they_were_cut(tmp_path):
+    rows_by_seed, file, columns = benchmark("rows_by_seed"), tmp_path / "rows.csv", ["seed", "square"]
+    computed = []
+
+    def square(seed):
+        computed.append(seed)
+        return {"seed": seed, "square": seed**2}
+
+    (first,) = rows_by_seed.run([5], file, columns, square)
     with file.open("a") as rows:
-        rows.write("6,0.0,0.1")  # killed while it wrote
-    assert study.done(file) == [first]
-    rows = study.run([5, 6], file)
-    assert [row["seed"] for row in rows] == [5, 6]
-    assert rows[0] == first
-    assert [row["seed"] for row in study.done(file)] == [5, 6]
-    study.show(rows)
-    assert capsys.readouterr().out.startswith("2 runs, 2 converged")
+        rows.write("6,")  # killed while it wrote
+    assert rows_by_seed.done(file, columns) == [first]
+    rows = rows_by_seed.run([5, 6], file, columns, square)
+    assert rows == [{"seed": 5, "square": 25}, {"seed": 6, "square": 36}] == rows_by_seed.done(file, columns)
+    assert computed == [5, 6]
+    assert rows_by_seed.run([6], file, columns, square) == rows[1:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "options"), [("simulated_people", {}), ("wrong_answers", {"wrong": 0.2})])
+def test_a_run_gives_its_row_and_rows_are_summed_up(name, options, capsys, monkeypatch):
+    study = benchmark(name)
+    monkeypatch.setattr(study, "ANSWERS", 8)
+    if name == "wrong_answers":
+        monkeypatch.setattr(study, "MARKS", (3, 6))
+    row = study.one_run(5, **options)
+    assert set(row) <= set(study.COLUMNS)
+    assert row["converged"]
+    study.show([row, row | {"seed": 6, "log score": -0.3}])
+    assert capsys.readouterr().out.startswith("2 runs, 2 ")
 
 
 @pytest.fixture(scope="module")

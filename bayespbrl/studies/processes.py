@@ -111,11 +111,11 @@ def _plain(error: Exception) -> Exception:
 
 @contextmanager
 def trial_processes(jobs: int) -> Iterator[Executor]:
-    """`TrialProcesses`, each with a single thread where there are several.
+    """`TrialProcesses`, each with a single thread, so that sums are rounded alike however many there are.
 
     Where the block raises, the processes are terminated at once: a trial continues from disk when it is called again.
     """
-    with _environment(ONE_THREAD if jobs > 1 else {}):
+    with _environment(ONE_THREAD):
         pool = TrialProcesses(jobs)
         try:
             yield pool

@@ -1,0 +1,33 @@
+"""A row of figures a seed, appended to a CSV file as it comes, so that a study that was cut goes on where it was."""
+
+import csv
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from bayespbrl.runs.files import written_aside
+
+Row = dict[str, float]
+
+
+def done(file: Path, columns: Sequence[str]) -> list[Row]:
+    """The rows so far; a last one that is cut off is dropped."""
+    if not file.exists():
+        return []
+    with file.open() as lines:
+        rows = [row for row in csv.DictReader(lines) if all(row[name] not in (None, "") for name in columns)]
+    return [{name: float(row[name]) for name in columns} for row in rows]
+
+
+def run(seeds: Sequence[int], file: Path, columns: Sequence[str], one_run: Callable[[int], Row]) -> list[Row]:
+    """All rows, after the missing runs."""
+    rows = done(file, columns)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with written_aside(file) as aside:
+        pd.DataFrame(rows, columns=list(columns)).to_csv(aside, index=False, lineterminator="\r\n")
+    for seed in sorted(set(seeds) - {int(row["seed"]) for row in rows}):
+        rows.append({name: round(value, 5) for name, value in one_run(seed).items()})
+        with file.open("a", newline="") as lines:
+            csv.DictWriter(lines, columns).writerow(rows[-1])
+    return [row for row in rows if int(row["seed"]) in seeds]
