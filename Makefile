@@ -3,9 +3,11 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-# One test process a core. Each holds up to 1.5 GiB; a process that is done takes tests from another. Of pytest's installed
-# plugins only xdist is loaded: importing the others takes each process seconds.
-PYTEST := PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -p xdist -q -n auto --maxprocesses 8 --dist worksteal
+# One test process a core and one more, because some wait for browsers, kernels and servers; at most eight. Each holds up to
+# 1.5 GiB; a process that is done takes tests from another. Of pytest's installed plugins only xdist is loaded: importing the
+# others takes each process seconds.
+WORKERS := $(shell $(PYTHON) -c 'import os; print(min(8, 1 + (os.cpu_count() or 1)))')
+PYTEST := PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -p xdist -q -n $(WORKERS) --dist worksteal
 
 .PHONY: run test check fast results results-check neighbours
 .DEFAULT_GOAL := run

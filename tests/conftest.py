@@ -78,7 +78,9 @@ os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTEN
 os.environ["PYTHONWARNINGS"] = "ignore:Error reading persistent compilation cache entry"
 # Compilation is most of the work of a first session: the older of two generators of code takes half as long. XLA ends
 # the process where it does not know an option, so only the versions that were tried get it.
-COMPILER = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+COMPILER = (
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 --xla_backend_optimization_level=1"
+)
 if version("jaxlib").startswith("0.10.") and COMPILER not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {COMPILER}".strip()
 
