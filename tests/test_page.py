@@ -152,7 +152,7 @@ def test_a_reload_and_a_second_tab_show_the_same_question_and_count_no_answer_tw
 
         def hold(route):  # both answer the same question before the server hears either
             both.append(route)
-            for each in both if len(both) == 2 else ():
+            for each in both if len(both) == 2 else both[2:]:
                 each.continue_()
 
         for each in (opened, other):
@@ -328,6 +328,17 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
         assert call(gridworld, "POST", f"{token}/answer", json.dumps({"turn": wrong, "answer": "first"}))[0] == 409
     assert gridworld.session.learner.log.log_file.read_bytes() == before
     assert call(gridworld, "POST", f"{token}/answer", good)[0] == 204
+
+
+def test_a_message_that_is_sent_again_is_heard_once_and_one_of_another_window_is_refused(gridworld):
+    gridworld.session.wait(timeout=60)
+    body = json.dumps({"turn": gridworld.session.view["turn"], "answer": "first", "seconds": 1.0})
+    sent = [
+        call(gridworld, "POST", f"/{gridworld.token}/answer", body, **{"Idempotency-Key": key})[0] for key in "1121"
+    ]
+    assert sent == [204, 204, 409, 204]
+    assert call(gridworld, "POST", f"/{gridworld.token}/answer", body)[0] == 409
+    assert answers_of(gridworld) == ["first"]
 
 
 def test_ten_megabytes_are_not_read(gridworld):

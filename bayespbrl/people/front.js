@@ -15,6 +15,7 @@ const KEYS = {
 const SAID = {
   first: "First is better", second: "Second is better", tie: "No difference", skip: "Skipped", undo: "Taken back", begin: "Practice",
 };
+const LOST = "The connection is lost. Trying again…";
 const REST = 0.8; // seconds on the last picture before the clips start again
 
 const HTML = `
@@ -251,13 +252,13 @@ function render({ model, el }) {
   }
 
   function hear(message) {
-    if (message.connection === "lost") warn("The connection is lost. Trying again…");
+    if (message.connection === "lost") warn(LOST);
     if (message.connection === "gone") { lock(true); warn(message.say); }
-    if (message.connection === "back") warn(null);
+    if (message.connection === "back" && note.textContent === LOST) warn(null);
     if (message.refused === undefined || message.refused !== answered) return;
     answered = null;
     clearTimeout(slow);
-    take().then(() => warn(message.say));
+    take().finally(() => warn(message.say));
   }
 
   function key(event) {

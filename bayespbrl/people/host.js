@@ -16,20 +16,20 @@ const model = {
   send: (message) => post(message),
 };
 
-// Sent again until the server has heard it; the server takes each turn once.
+// Sent again until the server has heard it. The server takes each turn once, and knows by the key what is sent again,
+// by this page or by the browser.
 async function post(message) {
+  const key = crypto.getRandomValues(new Uint32Array(4)).join("-");
   for (let again = false; ; again = true) {
     try {
       const reply = await fetch("answer", {
         method: "POST",
-        headers: { "Content-Type": "application/json" },
+        headers: { "Content-Type": "application/json", "Idempotency-Key": key },
         body: JSON.stringify(message),
       });
       if (again) fire("msg:custom", { connection: "back" });
       if (reply.ok) return;
-      // what is refused when it is sent again was heard the first time
-      const say = reply.status !== 409 ? await reply.text() : again ? null : ELSEWHERE;
-      fire("msg:custom", { refused: message.turn, say });
+      fire("msg:custom", { refused: message.turn, say: reply.status === 409 ? ELSEWHERE : await reply.text() });
       return;
     } catch {
       fire("msg:custom", { connection: "lost" });

@@ -69,6 +69,7 @@ class Page:
         self.session = session
         self._seats = {secrets.token_urlsafe(16): seat for seat in session.seats}
         self.token = next(iter(self._seats))  # of the first or only person
+        self._heard: dict[int, str | None] = {}  # the key of the answer to each turn
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, port), family=family)
@@ -150,13 +151,20 @@ class Page:
         except OverflowError:
             return PlainTextResponse(f"body: expected at most {LARGEST_BODY} bytes", 413)
         try:
-            turn, answer, seconds = answer_of(json.loads(body))
-            await asyncio.to_thread(seat_of(request).answer, turn, answer, seconds)
+            message, key = answer_of(json.loads(body)), request.headers.get("idempotency-key")
+            await asyncio.to_thread(self._take, seat_of(request), key, *message)
         except Stale as error:
             return PlainTextResponse(str(error), 409)
         except (ValueError, RecursionError) as error:
             return PlainTextResponse(" ".join(str(error).split())[:300], 400)
         return Response(status_code=204)
+
+    def _take(self, seat: Seat, key: str | None, turn: int, answer: str, seconds: float | None) -> None:
+        """`Seat.answer`, once where the same message is sent again because its reply was lost."""
+        with self.session.changed:
+            if key is None or self._heard.get(turn) != key:
+                seat.answer(turn, answer, seconds)
+                self._heard[turn] = key
 
     async def _events(self, request: Request) -> Response:
         return StreamingResponse(self._views(seat_of(request)), media_type="text/event-stream", headers=HEADERS)
