@@ -18,7 +18,7 @@ from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement.check import Check, checked
+from bayespbrl.improvement.check import Check, checked, clearly_better
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
@@ -96,10 +96,10 @@ class Cycle:
     def collect(self, state: LearnerState) -> Entry:
         """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
         options, asking = self.settings.rollouts, self.settings.questions
-        began = time.perf_counter()
+        began, restarted = time.perf_counter(), state.restarts(self.settings)
         collected = rollouts.rollout(
             self.environment,
-            state.policy,
+            state.first_policy if restarted else state.policy,
             key=self._key(COLLECT, state.iteration),
             episodes=options.trajectories_per_iteration,
             max_steps=options.max_steps,
@@ -114,6 +114,7 @@ class Cycle:
             "iteration": state.iteration + 1,
             **{name: value for name, value in vars(chosen).items() if value is not None},
             **({} if clips is None else {"clips": clips}),
+            **({"restarted": True} if restarted else {}),
             "seconds": time.perf_counter() - began,
         }
         return _entry(event, trajectories=collected)
@@ -142,7 +143,8 @@ class Cycle:
 
     def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> questions.Chosen:
         options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)
-        new, best = range(len(state.trajectories), len(known)), self._of_iteration(state.best)
+        favourite = state.best if state.restart is None else state.restart.number
+        new, best = range(len(state.trajectories), len(known)), self._of_iteration(favourite)
         opponents = opponents_from_the_same_start(known, state.preferences, best) if options.same_start else {}
         if state.estimate is None:
             return questions.first_questions(new, opponents, options, rng=rng)
@@ -198,12 +200,8 @@ class Cycle:
         clock.append(time.perf_counter())
         check, of_best = self._check(state, utility) if self.settings.update.checked else (None, None)
         improved, bound = self.update(state, utility, check)
-        tried = self._tried(improved.policy)
-        newest = state.iteration + 1
-        if check is None or of_best is None or (utility.trajectory_utilities(tried) - of_best).mean() > 0:
-            kept = newest
-        else:
-            kept = check.best
+        tried, newest = self._tried(improved.policy), state.iteration + 1
+        kept = self._kept(state, utility, check, of_best, tried)
         clock.append(time.perf_counter())
         evaluated = self.evaluated(improved.policy if check is None else greedy(improved.policy))
         value = float(evaluated.total.mean())
@@ -216,6 +214,7 @@ class Cycle:
             "value_newest": value,
             "kept": kept,
             **({} if check is None else {"check": asdict(check)}),
+            **({} if state.restart is None else {"restarted": state.started}),
             "terminated": float(evaluated.terminated.mean()),  # a share of the episodes
             **utility.quality.summary(),
             **improved.summary(),
@@ -248,14 +247,34 @@ class Cycle:
         With it come the utilities of the better one's trajectories; None of the first policy, which is not tried. What
         an earlier version did not try is tried now.
         """
-        if state.iteration == 0:
-            return Check(0, state.trust), None
+        if state.iteration == state.started:
+            return Check(state.iteration, state.trust), None
         newest = utility.trajectory_utilities(state.tried or self._tried(state.policy))
-        if state.best == 0:
+        if state.best == state.started:
             return Check(state.iteration, state.trust), newest
         best = utility.trajectory_utilities(state.best_tried or self._tried(state.best_policy))
         check = checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
         return check, newest if check.best == state.iteration else best
+
+    @staticmethod
+    def _kept(
+        state: LearnerState,
+        utility: UtilityEstimate,
+        check: Check | None,
+        of_best: Float[np.ndarray, " n"] | None,
+        tried: tuple[Trajectory, ...],
+    ) -> int:
+        """The number of the policy that the run keeps now, by the trajectories `tried` of the newest, and of others."""
+        newest = state.iteration + 1
+        if check is None:
+            return newest
+        better = of_best is None or (utility.trajectory_utilities(tried) - of_best).mean() > 0
+        kept = newest if better else check.best
+        if state.restart is None:
+            return kept
+        if not better:
+            tried = state.tried if check.best == state.iteration else state.best_tried
+        return kept if clearly_better(utility, tried, state.restart.tried) else state.restart.number
 
     def estimate(self, state: LearnerState) -> UtilityEstimate:
         """Step 1, the utility from all answers so far."""
@@ -283,7 +302,8 @@ class Cycle:
         """Step 2: an update is proposed, the schedule decides on its bound, the update is applied."""
         settings, iteration = self.settings, state.iteration
         number = settings.rollouts.trajectories_per_iteration
-        taken = recent(state.trajectories, settings.update, an_iteration=number)
+        since_start = state.trajectories[number * state.started :]
+        taken = recent(since_start, settings.update, an_iteration=number)
         steps = transitions(taken)
         rng, key = self._rng(FEATURES, 2 * iteration + 1), self._key(IMPROVE, iteration)
         state_action_features = self.feature_source.of_steps(steps, settings.features.of_critic, rng=rng)
@@ -293,7 +313,7 @@ class Cycle:
             steps,
             utilities,
             states_of_update(
-                state.trajectories,
+                since_start,
                 settings.update,
                 an_iteration=number,
                 rng=self._rng(VISITED, iteration),

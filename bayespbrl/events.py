@@ -2,7 +2,8 @@
 
 Resuming a run, undoing an answer and reporting on a run in progress all use this fold. There are five events:
 
-* `collected`: new trajectories (step 3), and which of them to ask about, in order (step 4);
+* `collected`: new trajectories (step 3), and which of them to ask about, in order (step 4); `restarted` where they
+  follow the first policy again;
 * `asked`: a question, with the order in which the two trajectories were shown, the number of the earlier question that
   it `repeats`, if any, and the `answerer` who is asked, where several people answer at once;
 * `answered`: the expert's answer; `answerer`, the name of who gave it, and `seconds`, the time they took, where known;
@@ -49,18 +50,36 @@ class Log(Protocol):
 
 
 @dataclass(frozen=True)
+class Restart:
+    """The policy was started anew.
+
+    Attributes:
+      iteration: iterations completed by then.
+      number, policy, tried: of the policy that the run kept by then: its number, and its trajectories without noise.
+    """
+
+    iteration: int
+    number: int
+    policy: Any
+    tried: tuple[Trajectory, ...]
+
+
+@dataclass(frozen=True)
 class LearnerState:
     """What the learner knows between two calls.
 
     Attributes:
       policy: the newest policy, which the next trajectories follow.
+      first_policy: the one that a policy started anew begins with.
       best_policy: where updates are checked, the one that the posterior thinks best of the policies before the newest;
         the next update starts there after a step back.
-      best: the number of the best policy, that is of the iterations before it.
-      kept: the number of the policy that the run keeps: the best or, if the posterior prefers it, the newest.
+      best: the number of the best policy, that is of the iterations before it; since a restart, where there was one.
+      kept: the number of the policy that the run keeps: the best or, if the posterior prefers it, the newest; after a
+        restart that kept before it, unless one of these is clearly better.
       tried, best_tried: trajectories of the newest and of the best policy without their noise, where updates are
         checked; () where there are none.
       trust: share of the KL bound that the next update may use; it falls after a step back.
+      restart: when the policy was started anew, and what was kept by then; None: it was not.
       estimate: the last utility estimate; None before the first.
       bound: the last decision on the KL bound; None before the first.
       iteration: iterations completed.
@@ -83,12 +102,14 @@ class LearnerState:
     """
 
     policy: Any
+    first_policy: Any = None
     best_policy: Any = None
     best: int = 0
     kept: int = 0
     tried: tuple[Trajectory, ...] = ()
     best_tried: tuple[Trajectory, ...] = ()
     trust: float = 1.0
+    restart: Restart | None = None
     estimate: UtilityEstimate | None = None
     bound: Bound | None = None
     iteration: int = 0
@@ -110,7 +131,17 @@ class LearnerState:
 
     def finished(self, settings: Settings) -> bool:
         """Whether a run with these settings ends here: after an iteration, not within one."""
-        return not self.collected and settings.finished(self.iteration, self.preferences.answers, self.unasked)
+        restart = None if self.restart is None else self.restart.iteration
+        return not self.collected and settings.finished(self.iteration, self.preferences.answers, self.unasked, restart)
+
+    def restarts(self, settings: Settings) -> bool:
+        """Whether the next trajectories follow the first policy again."""
+        return self.restart is None and settings.restarts(self.iteration, self.preferences.answers, self.unasked)
+
+    @property
+    def started(self) -> int:
+        """Iterations completed when the present policy was started."""
+        return 0 if self.restart is None else self.restart.iteration
 
     @property
     def query(self) -> Query | None:
@@ -130,7 +161,16 @@ class LearnerState:
     @property
     def kept_policy(self) -> Any:
         """The policy number `kept`."""
+        if self.restart is not None and self.kept == self.restart.number:
+            return self.restart.policy
         return self.policy if self.kept == self.iteration else self.best_policy
+
+    @property
+    def kept_tried(self) -> tuple[Trajectory, ...]:
+        """Trajectories of the policy number `kept` without its noise; () where it was not tried."""
+        if self.restart is not None and self.kept == self.restart.number:
+            return self.restart.tried
+        return self.tried if self.kept == self.iteration else self.best_tried
 
 
 def apply(state: LearnerState, entry: Entry) -> LearnerState:
@@ -154,7 +194,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
             kept = operator.index(summary.get("kept", best))
             if check is not None and best not in (state.best, state.iteration):
                 raise ValueError(f"improved: expected {state.best} or {state.iteration} as the best, got {best}")
-            if kept not in (best, iteration):
+            if kept not in (best, iteration, *(() if state.restart is None else (state.restart.number,))):
                 raise ValueError(f"improved: expected policy {best} or {iteration} to be kept, got {kept}")
             last_is_best = best == state.iteration
             return replace(
@@ -240,6 +280,18 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     opponents = event.get("opponents")
     if not preferences.undominated and opponents is None:
         preferences, candidates = preferences.start(candidates[0]), candidates[1:]
+    if event.get("restarted", False):
+        kept = Restart(state.iteration, state.kept, state.kept_policy, state.kept_tried)
+        state = replace(
+            state,
+            policy=state.first_policy,
+            best=state.iteration,
+            best_policy=None,
+            tried=(),
+            best_tried=(),
+            trust=1.0,
+            restart=kept,
+        )
     return replace(
         state,
         trajectories=state.trajectories + tuple(parts["trajectories"]),

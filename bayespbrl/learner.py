@@ -91,7 +91,8 @@ class Learner:
         )
         self.log: Log | None = None
         self.own_policy = own_policy
-        self.state = events.replay(LearnerState(self.first_policy()), entries)
+        first = self.first_policy()
+        self.state = events.replay(LearnerState(first, first), entries)
 
     def logged(self, log: Log) -> "Learner":
         """The same learner, which from now on appends what happens to `log`."""
@@ -108,7 +109,8 @@ class Learner:
     @property
     def policy(self) -> Any:
         """The policy that the posterior thinks best of those tried, without its noise; else the newest, with it."""
-        return greedy(self.state.kept_policy) if self.state.tried else self.state.kept_policy
+        tried = self.state.tried or self.state.restart is not None
+        return greedy(self.state.kept_policy) if tried else self.state.kept_policy
 
     @property
     def last_policy(self) -> Any:

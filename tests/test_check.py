@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayespbrl.improvement.check import LEAST_TRUST, Check, checked
+from bayespbrl.improvement.check import LEAST_TRUST, Check, checked, clearly_better
 
 NOISE = np.array([-1.0, 1.0, -0.5, 0.5])
 
@@ -28,3 +28,29 @@ def test_a_step_forward_is_kept_and_a_step_back_is_taken_back(gain, trust, expec
 
 def test_equal_trajectories_change_nothing():
     assert checked(np.zeros(4), newest=7, best=3, trust=0.5) == Check(3, 0.5)
+
+
+class Posterior:
+    """Draws of a utility, and their mean, whatever the trajectories; a trajectory is its own row of draws."""
+
+    posterior = "some"
+
+    def trajectory_draws(self, trajectories):
+        return np.array(trajectories).T
+
+    def trajectory_utilities(self, trajectories):
+        return np.mean(trajectories, axis=1)
+
+
+@pytest.mark.parametrize(("worse", "expected"), [(0, True), (2, True), (3, False), (8, False)])
+def test_a_policy_nobody_is_asked_about_has_to_be_better_by_three_in_four_draws(worse, expected):
+    draws = np.r_[np.full(worse, -1.0), np.full(8 - worse, 100.0)]
+    tried = [draws + 2.0, draws - 2.0]  # two starts, of which the mean counts
+    assert clearly_better(Posterior(), tried, np.zeros((2, 8))) == expected
+
+
+def test_without_a_posterior_the_estimate_decides():
+    estimate = Posterior()
+    estimate.posterior = None
+    assert clearly_better(estimate, [np.r_[-1.0, -1.0, 3.0]], np.zeros((1, 3)))
+    assert not clearly_better(estimate, np.zeros((1, 3)), np.zeros((1, 3)))

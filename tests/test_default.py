@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from itertools import pairwise
 
 import gymnasium
@@ -12,7 +13,9 @@ import xarray as xr
 from toys import Slope, fingerprint
 
 import bayespbrl
-from bayespbrl import Learner, ReturnExpert, rollouts
+from bayespbrl import Learner, ReturnExpert, cycle, rollouts
+from bayespbrl.events import answered
+from bayespbrl.improvement.check import Check
 from bayespbrl.policies.actor import Actor
 from bayespbrl.rollouts import rollout
 from bayespbrl.runs.files import write_netcdf
@@ -22,11 +25,20 @@ FAST = {"max_steps": 8, "evaluation_episodes": 4, "centres": 20, "seed": 3, "hyp
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A finished run of the default on a task without a preset, comparing by start."""
+    """A finished run of the default on a task without a preset, comparing by start, with a single policy."""
     directory = tmp_path_factory.mktemp("runs") / "slope"
     env = gymnasium.wrappers.TimeLimit(Slope(), 8)
-    bayespbrl.start(env, directory, answers=4, same_start=True, **FAST).run(ReturnExpert())
+    bayespbrl.start(env, directory, answers=4, same_start=True, restart_iterations=0, **FAST).run(ReturnExpert())
     return bayespbrl.load(directory, env=env)
+
+
+@pytest.fixture(scope="module")
+def restarted(tmp_path_factory):
+    """The same with a policy that is started anew after the last answer."""
+    directory = tmp_path_factory.mktemp("runs") / "restarted"
+    options = {"answers": 4, "same_start": True, "restart_iterations": 3, **FAST}
+    bayespbrl.start(Slope(), directory, **options).run(ReturnExpert())
+    return bayespbrl.load(directory, env=Slope())
 
 
 def test_the_budget_ends_the_questions_and_the_run_a_little_later(run):
@@ -88,6 +100,75 @@ def test_undo_takes_back_which_policies_were_tried_and_kept():
         undone.tell([ReturnExpert()(*query.trajectories) for query in questions])
     assert fingerprint(undone) == fingerprint(straight)
     assert (undone.state.kept, undone.state.best) == (straight.state.kept, straight.state.best)
+
+
+def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
+    log = [json.loads(line) for line in (restarted.path / "events.jsonl").read_text().splitlines()]
+    (began,) = [event["iteration"] - 1 for event in log if event.get("restarted")]
+    total, restart = len(restarted.iterations), restarted.learner.state.restart
+    assert total == began + 3
+    assert restarted.learner.finished
+    assert [summary["answers"] for summary in restarted.iterations[began - 1 :]] == [4] * 4
+    assert "restarted" not in restarted.iterations[began - 1]
+    assert all(summary["restarted"] == began for summary in restarted.iterations[began:])
+    assert restarted.iterations[:began] == [
+        {**summary, "seconds": mine["seconds"]}
+        for summary, mine in zip(run.iterations, restarted.iterations[:began], strict=False)
+    ]
+    first = restarted.learner.first_policy()
+    drawn = rollouts.rollout(
+        restarted.learner.environment,
+        first,
+        key=restarted.learner.cycle._key(cycle.COLLECT, began),
+        episodes=10,
+        hold=restarted.learner.cycle._hold(restarted.learner.state),
+        max_steps=8,
+        starts=restarted.learner.cycle._starts(began),
+    )
+    for mine, other in zip(restarted.trajectories[10 * began : 10 * began + 10], drawn, strict=True):
+        np.testing.assert_array_equal(mine.actions, other.actions)
+    checks = [summary["check"] for summary in restarted.iterations[began:]]
+    assert [check["best"] for check in checks[:2]] == [began, began + 1]
+    assert restart.number == restarted.iterations[began - 1]["kept"]
+
+
+def test_after_a_restart_the_kept_policy_gives_way_only_to_a_clearly_better_one(restarted):
+    state, cycle_ = restarted.learner.state, restarted.learner.cycle
+    tried, check = state.tried, Check(state.best, 1.0)
+    of_best = state.estimate.trajectory_utilities(state.best_tried)
+    for kept, expected in ((tried, False), (worst_first(state, tried), True)):
+        before = replace(state, restart=replace(state.restart, tried=kept))
+        number = cycle_._kept(before, state.estimate, check, of_best, tried)
+        assert (number != state.restart.number) == expected
+    if state.kept == state.restart.number:
+        assert restarted.learner.policy.policy is state.restart.policy
+
+
+def worst_first(state, tried):
+    """As many trajectories as `tried`, each the one that the posterior thinks least of."""
+    everything = state.trajectories
+    worst = everything[int(np.argmin(state.estimate.trajectory_utilities(everything)))]
+    return tuple(worst for _ in tried)
+
+
+@pytest.mark.slow
+def test_a_restarted_run_that_was_stopped_or_undone_goes_on_bit_for_bit(restarted, tmp_path):
+    options = {"answers": 4, "same_start": True, "restart_iterations": 3, **FAST}
+    again = bayespbrl.start(Slope(), tmp_path / "run", **options)
+    expert = ReturnExpert()
+    while query := again.ask():
+        again.tell([expert(*query[0].trajectories)])
+    assert again.finished
+    again.undo()  # the last answer, and the restart with it
+    assert again.state.restart is None
+    assert not again.finished
+    again.record(answered(again.state.query.number, expert(*again.state.query.trajectories)))
+    stopped = bayespbrl.resume(tmp_path / "run", env=Slope())
+    while not stopped.state.restart:
+        stopped.record(stopped.cycle.next(stopped.state))
+    finished = bayespbrl.resume(tmp_path / "run", env=Slope()).run(expert)
+    assert fingerprint(finished) == fingerprint(restarted.learner)
+    assert finished.state.kept == restarted.learner.state.kept
 
 
 class Plain:

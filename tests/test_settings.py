@@ -57,6 +57,7 @@ BAD = {
     "repeats": [None, 1, -0.1, "all"],
     "checked": [None, 1, "yes"],
     "check_episodes": [None, 1, 2.5, True],
+    "restart_iterations": [None, -1, 2.5, True],
     "critic_iterations": [0, -4, True, 2.0],
 }
 
@@ -152,13 +153,30 @@ def test_the_default_derives_from_spaces_and_horizon_what_tasks_differ_in():
 
 
 def test_iterations_follow_from_the_budget_of_answers():
-    settings = settings_for("SomebodysEnv-v3", answers=6)
+    settings = settings_for("SomebodysEnv-v3", answers=6, restart_iterations=0)
     assert (settings.iterations, settings.most_iterations) == (None, 14)
     assert not settings.finished(iteration=6, answers=5, unasked=4)
     assert not settings.finished(iteration=9, answers=6, unasked=4)
     assert settings.finished(iteration=9, answers=6, unasked=5)  # the policy has caught up with the last answer
     assert settings.finished(iteration=13, answers=3, unasked=10)  # nothing was worth asking
     assert settings.finished(iteration=14, answers=5, unasked=0)
+    assert not settings.restarts(iteration=13, answers=6, unasked=4)
+
+    restarted = settings_for("SomebodysEnv-v3", answers=6)
+    assert restarted.most_iterations == 17
+    restarts = [restarted.restarts(8, 5, 9), restarted.restarts(2, 6, 0), restarted.restarts(8, 3, 10)]
+    assert (*restarts, restarted.restarts(9, 5, 0)) == (False, True, True, True)
+    assert not restarted.finished(iteration=9, answers=6, unasked=5)
+    assert not restarted.finished(iteration=9, answers=6, unasked=9, restart=2)
+    assert restarted.finished(iteration=10, answers=6, unasked=9, restart=2)
+    assert restarted.finished(iteration=17, answers=5, unasked=0, restart=10)
+
+    given = settings_for("SomebodysEnv-v3", answers=6, iterations=20)  # as many iterations as the user said
+    assert not given.restarts(iteration=12, answers=6, unasked=4)
+    assert given.finished(iteration=12, answers=6, unasked=5)
+    table = settings_for("SomebodysEnv-v3", task=Task(Discrete(5), Discrete(2), horizon=10), answers=6)
+    assert not table.restarts(iteration=9, answers=6, unasked=5)
+
     paper = settings_for("gridworld", preset="paper")
     assert not paper.finished(iteration=24, answers=99, unasked=20)
     assert paper.finished(iteration=25, answers=0, unasked=0)

@@ -51,6 +51,8 @@ def gain_calibration(
 def _stated_and_gained(summaries: Sequence[Mapping[str, Any]], statistic: str) -> list[tuple[float, bool]]:
     found = []
     for before, after in pairwise(summaries):
+        if after.get("restarted", -1) == before.get("iteration"):
+            continue  # the policy was started anew in between
         figures = [summary.get("value_newest", summary.get("value")) for summary in (before, after)]
         figures.append((after.get("schedule") or {}).get(statistic))
         if all(isinstance(figure, int | float) and np.isfinite(figure) for figure in figures):

@@ -5,12 +5,17 @@ hidden reward, says whether that is better. They are without the policy's noise 
 that neither luck nor exploration decides. After a step back the run goes on from the best policy, with smaller updates.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from bayespbrl.trajectories import Trajectory
+from bayespbrl.utility.estimate import UtilityEstimate
+
 LEAST_TRUST = 0.05
+CLEARLY = 0.75  # share of the posterior's draws
 STANDARD_ERRORS = 1.0  # by which the newest policy has to be worse for a step back
 
 
@@ -47,3 +52,15 @@ def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, tru
     if gain < -STANDARD_ERRORS * error:
         return Check(best, max(LEAST_TRUST, trust / 2), True, gain, error)
     return Check(best, trust, False, gain, error)
+
+
+def clearly_better(utility: UtilityEstimate, tried: Sequence[Trajectory], kept: Sequence[Trajectory]) -> bool:
+    """Whether a policy that nobody is asked about replaces the one that is kept.
+
+    It does where `CLEARLY` of the draws prefer its trajectories to the kept policy's from the same starts; without a
+    posterior, where the estimate does.
+    """
+    if utility.posterior is None:
+        return bool((utility.trajectory_utilities(tried) - utility.trajectory_utilities(kept)).mean() > 0)
+    gains = (utility.trajectory_draws(tried) - utility.trajectory_draws(kept)).mean(axis=1)
+    return bool(np.mean(gains > 0) >= CLEARLY)

@@ -38,6 +38,9 @@ class PolicyUpdate:
         that the posterior thinks best, without noise, and goes on from there after a step back. The paper's learner
         never looks back.
       check_episodes: number of these trajectories, of each policy.
+      restart_iterations: the run ends with so many iterations of a policy that is started anew, because the first may
+        be stuck where its own trajectories show nothing better; 0: none. Only where updates are checked and the number
+        of iterations follows from the answers.
       update_states: most of these states that the update takes, drawn at random, where they are continuous: it bounds
         time and memory for long episodes.
     """
@@ -50,6 +53,7 @@ class PolicyUpdate:
     update_states: int = 20_000
     checked: bool = False
     check_episodes: int = 8
+    restart_iterations: int = 0
 
     def __post_init__(self) -> None:
         checks.positive("kl_bound", self.kl_bound)
@@ -62,6 +66,7 @@ class PolicyUpdate:
         if not isinstance(self.checked, bool):
             raise ValueError(f"checked: expected true or false, got {self.checked!r}")
         checks.whole("check_episodes", self.check_episodes, 2)
+        checks.whole("restart_iterations", self.restart_iterations, 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -106,6 +106,7 @@ DEFAULT: dict[str, Any] = {
     "unasked_iterations": 4,
     "worthwhile": True,
     "checked": True,
+    "restart_iterations": 8,  # what the first policy misses, one that begins with the last posterior often finds
     "constant_utility": True,  # CartPole's answers are foreseen better
     "critic_iterations": 4,  # on the hidden reward Pendulum forgets with all transitions
     "recent_iterations": 4,
@@ -118,6 +119,7 @@ PEOPLE: dict[str, Any] = {
     "repeats": 0.1,  # a simulated expert would only repeat itself
     "unasked_iterations": 0,  # a person waits for them
     "evaluation_episodes": 20,  # and for these
+    "restart_iterations": 0,  # and for these
     "worthwhile": False,  # the page says what an answer is worth, and leaves it to the person to stop
 }
 
@@ -142,11 +144,12 @@ class Task:
         episode (long for MountainCarContinuous; short for InvertedPendulum, which falls at once); in few dimensions
         functions are as fine as half the median rule, which learns Pendulum in half the iterations. Discrete actions
         have features of their own each, so there are fewer centres and more trajectories (CartPole); whether such a
-        policy fails in an episode is a matter of luck, so more of them check it.
+        policy fails in an episode is a matter of luck, so more of them check it. A policy of discrete states, a table,
+        is not stuck, and is not started anew.
         """
         continuous = isinstance(self.action_space, Box)
         dimensions = self.observation_space.shape[0] if isinstance(self.observation_space, Box) else 0
-        return {
+        return ({} if dimensions else {"restart_iterations": 0}) | {
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
             "trajectories_per_iteration": 10 if continuous else 20,

@@ -190,13 +190,36 @@ class Settings:
         budget = self.questions.answers
         if self.iterations is None:
             assert budget is not None
-            return 3 * budget // 2 + LAST_ITERATIONS
+            return 3 * budget // 2 + (self._restarted or LAST_ITERATIONS)
         return self.iterations
 
-    def finished(self, iteration: int, answers: int, unasked: int) -> bool:
-        """Whether a run ends after so many iterations and answers, with so many iterations in a row unasked."""
+    @property
+    def _restarted(self) -> int:
+        """Iterations of the policy that is started anew."""
+        return self.update.restart_iterations if self.update.checked and self.iterations is None else 0
+
+    def restarts(self, iteration: int, answers: int, unasked: int) -> bool:
+        """Whether the policy is started anew, because the answers have said what they can; arguments as of `finished`.
+
+        Decision: at once after the last answer, since nobody is asked about what the first policy does then.
+        """
+        budget = self.questions.answers
+        if not self._restarted or budget is None:
+            return False
+        return answers >= budget or unasked >= MOST_UNASKED or iteration >= self.most_iterations - self._restarted
+
+    def finished(self, iteration: int, answers: int, unasked: int, restart: int | None = None) -> bool:
+        """Whether a run ends.
+
+        Args:
+          iteration, answers: completed and given.
+          unasked: iterations in a row without a question.
+          restart: iterations completed when the policy was started anew; None: it was not.
+        """
         if iteration >= self.most_iterations:
             return True
+        if self._restarted:
+            return restart is not None and iteration >= restart + self._restarted
         if self.questions.answers is None:
             return False
         return unasked >= (LAST_ITERATIONS if answers >= self.questions.answers else MOST_UNASKED)
