@@ -331,7 +331,7 @@ def test_undo_as_an_answer_takes_the_previous_one_back_and_asks_it_again():
 
 
 def test_the_last_answers_can_be_undone_and_no_more_are_held_in_memory(monkeypatch):
-    monkeypatch.setattr(events, "MOST_UNDONE", 2)
+    monkeypatch.setattr(events.fold, "MOST_UNDONE", 2)
     run = learner(first_queries=5)
     for _ in range(4):
         run.tell(["tie"] * len(run.ask()))

@@ -1,0 +1,34 @@
+"""The events of a run and the learner's state: the state is a fold over an append-only log of events.
+
+Resuming a run, undoing an answer and reporting on a run in progress all use this fold. There are five events:
+
+* `collected`: new trajectories (step 3), and which of them to ask about, in order (step 4); `restarted` where they
+  follow the first policy again;
+* `asked`: a question, with the order in which the two trajectories were shown, the number of the earlier question that
+  it `repeats`, if any, and the `answerer` who is asked, where several people answer at once;
+* `answered`: the expert's answer; `answerer`, the name of who gave it, and `seconds`, the time they took, where known;
+* `improved`: a new estimate and a new policy (steps 1 and 2), which end an iteration;
+* `undone`: the last answer and everything after it is taken back.
+
+state                    what the learner knows between two calls
+entry                    one event, as a log keeps it
+fold                     the state after one more event
+"""
+
+from bayespbrl.events.entry import Entry, Log, answered, clips_in, has_figures, plain, surviving
+from bayespbrl.events.fold import apply, replay
+from bayespbrl.events.state import LearnerState, Restart
+
+__all__ = [
+    "Entry",
+    "LearnerState",
+    "Log",
+    "Restart",
+    "answered",
+    "apply",
+    "clips_in",
+    "has_figures",
+    "plain",
+    "replay",
+    "surviving",
+]

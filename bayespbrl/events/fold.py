@@ -1,0 +1,172 @@
+"""The fold: the learner's state after one more event."""
+
+import operator
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from bayespbrl import checks
+from bayespbrl.events.entry import Entry, clips_in, has_figures
+from bayespbrl.events.state import LearnerState, Restart
+from bayespbrl.improvement.schedules import Bound
+from bayespbrl.preferences import Answer, PastQuestion, Query, parse_answer
+
+# Each state holds all answers so far: to keep every state would take memory by the square of their number.
+MOST_UNDONE = 50
+
+
+def apply(state: LearnerState, entry: Entry) -> LearnerState:
+    """The state after one more event.
+
+    Raises:
+      ValueError: an unknown event, or one that cannot follow this state.
+    """
+    event = entry.event
+    match event.get("event"):
+        case "collected":
+            return _collected(state, event, entry.parts)
+        case "asked":
+            return _asked(state, event)
+        case "answered":
+            return _answered(state, event)
+        case "improved":
+            summary = _with_figures(event["summary"])
+            iteration, check = operator.index(event["iteration"]), summary.get("check")  # of a checked update
+            best = iteration if check is None else operator.index(check["best"])
+            kept = operator.index(summary.get("kept", best))
+            if check is not None and best not in (state.best, state.iteration):
+                raise ValueError(f"improved: expected {state.best} or {state.iteration} as the best, got {best}")
+            if kept not in (best, iteration, *(() if state.restart is None else (state.restart.number,))):
+                raise ValueError(f"improved: expected policy {best} or {iteration} to be kept, got {kept}")
+            last_is_best = best == state.iteration
+            return replace(
+                state,
+                policy=entry.parts["policy"],
+                best_policy=state.policy if last_is_best else state.best_policy,
+                best=best,
+                kept=kept,
+                tried=tuple(entry.parts.get("tried", ())),
+                best_tried=state.tried if last_is_best else state.best_tried,
+                trust=1.0 if check is None else float(check["trust"]),
+                estimate=entry.parts["estimate"],
+                bound=Bound.recalled(event["summary"]["kl_bound"], event["summary"]["schedule"]),
+                iteration=iteration,
+                collected=False,
+                candidates=(),
+                wanted=0,
+                summaries=(*state.summaries, event["summary"]),
+            )
+        case "undone":
+            if (before := state.previous) is None:
+                got = f"{MOST_UNDONE} undone" if state.past else "none yet"
+                raise ValueError(f"undo: expected an answer to take back, got {got}")
+            return before
+        case other:
+            raise ValueError(f"event: expected collected, asked, answered, improved or undone, got {other!r}")
+
+
+def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
+    """The state after all of `entries`.
+
+    Raises:
+      ValueError: as `apply`; also an incomplete event, as in a foreign log.
+    """
+    for entry in entries:
+        try:
+            state = apply(state, entry)
+        except (KeyError, TypeError, IndexError, AttributeError) as error:
+            reason = f"{type(error).__name__} {error}"
+            raise ValueError(f"event: expected a complete one, got {dict(entry.event)} ({reason})") from error
+    return state
+
+
+def _with_figures(summary: Any) -> Mapping[str, Any]:
+    """`summary`, where it has what all its readers need; `ValueError` where it has not."""
+    if not has_figures(summary):
+        raise ValueError(f"improved: expected a summary with answers and value, got {str(summary)[:60]}")
+    return dict(summary)
+
+
+def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:
+    candidates, preferences = tuple(event["candidates"]), state.preferences
+    opponents = event.get("opponents")
+    if not preferences.undominated and opponents is None:
+        preferences, candidates = preferences.start(candidates[0]), candidates[1:]
+    if event.get("restarted", False):
+        kept = Restart(state.iteration, state.kept, state.kept_policy, state.kept_tried)
+        state = replace(
+            state,
+            policy=state.first_policy,
+            best=state.iteration,
+            best_policy=None,
+            tried=(),
+            best_tried=(),
+            trust=1.0,
+            restart=kept,
+        )
+    return replace(
+        state,
+        trajectories=state.trajectories + tuple(parts["trajectories"]),
+        clips=state.clips + clips_in(event),
+        preferences=preferences,
+        collected=True,
+        candidates=candidates,
+        opponents={} if opponents is None else dict(zip(candidates, opponents, strict=True)),
+        information=event.get("information"),
+        wanted=event["wanted"],
+        unasked=0 if event["wanted"] else state.unasked + 1,
+    )
+
+
+def _asked(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
+    shown, repeats = (event["first"], event["second"]), event.get("repeats")
+    if any(not 0 <= number < len(state.trajectories) for number in shown):
+        raise ValueError(f"asked: expected trajectories below {len(state.trajectories)}, got {shown}")
+    if repeats is not None and (repeats, *shown[::-1]) not in [past[:3] for past in state.past]:
+        raise ValueError(f"asked: expected a question that was asked before with sides swapped, got {dict(event)}")
+    compared = state.compared
+    both = (compared[shown[0]], compared[shown[1]])
+    rivals, answerer = event.get("rivals"), event.get("answerer")
+    if answerer is not None:
+        checks.short_name("answerer", answerer)
+    if rivals is None and event["newcomer"] in shown and repeats is None:
+        incumbent = shown[shown[0] == event["newcomer"]]
+        newest = incumbent in state.preferences.undominated[-1:]
+        rivals = state.preferences.tied_with(incumbent) if newest else None
+    rivals = None if rivals is None else tuple(rivals)
+    query = Query(event["query"], *shown, event["newcomer"], both, repeats, rivals, answerer)
+    return replace(state, open=(*state.open, query), queries=query.number, shown=state.shown.union(shown))
+
+
+def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
+    query = next((waiting for waiting in state.open if waiting.number == event["query"]), None)
+    if query is None:
+        waiting = [waiting.number for waiting in state.open]
+        raise ValueError(f"answered: expected an answer to an open question of {waiting}, got one to {event['query']}")
+    answer, answerer, seconds = parse_answer(event["answer"]), event.get("answerer"), event.get("seconds")
+    if answerer is not None:
+        checks.short_name("answerer", answerer)
+    if seconds is not None:
+        checks.non_negative("seconds", seconds)
+    left, again = state.candidates, query.repeats is not None
+    if not again:
+        left = tuple(number for number in left if number != query.newcomer)
+    shown = (query.number, query.first, query.second, query.newcomer, query.repeats)
+    past = (*state.past, PastQuestion(*shown, answer, answerer, seconds))
+    after = replace(state, open=tuple(each for each in state.open if each is not query), candidates=left, past=past)
+    after = replace(after, before=(*state.before[1 - MOST_UNDONE :], replace(state, before=())))
+    if answer is Answer.SKIP:
+        return after
+    preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]
+    if again:
+        more = state.preferences.add_repeated(query.first, query.second, preferred=preferred, answerer=answerer)
+        return replace(after, preferences=more)
+    preferences = state.preferences.add(
+        query.newcomer,
+        query.incumbent,
+        preferred=preferred,
+        rivals=query.rivals,
+        shown_first=query.first,
+        answerer=answerer,
+    )
+    return replace(after, preferences=preferences, wanted=max(0, state.wanted - 1))

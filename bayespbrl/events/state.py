@@ -1,0 +1,135 @@
+"""What the learner knows between two calls; the fold over the events makes each state from the one before."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from bayespbrl.improvement.schedules import Bound
+from bayespbrl.preferences import PastQuestion, Preferences, Query
+from bayespbrl.settings import Settings
+from bayespbrl.trajectories import Trajectory, clips_of
+from bayespbrl.utility.estimate import UtilityEstimate
+
+
+@dataclass(frozen=True)
+class Restart:
+    """The policy was started anew.
+
+    Attributes:
+      iteration: iterations completed by then.
+      number, policy, tried: of the policy that the run kept by then: its number, and its trajectories without noise.
+    """
+
+    iteration: int
+    number: int
+    policy: Any
+    tried: tuple[Trajectory, ...]
+
+
+@dataclass(frozen=True)
+class LearnerState:
+    """What the learner knows between two calls.
+
+    Attributes:
+      policy: the newest policy, which the next trajectories follow.
+      first_policy: the one that a policy started anew begins with.
+      best_policy: where updates are checked, the one that the posterior thinks best of the policies before the newest;
+        the next update starts there after a step back.
+      best: the number of the best policy, that is of the iterations before it; since a restart, where there was one.
+      kept: the number of the policy that the run keeps: the best or, if the posterior prefers it, the newest; after a
+        restart that kept before it, unless one of these is clearly better.
+      tried, best_tried: trajectories of the newest and of the best policy without their noise, where updates are
+        checked; () where there are none.
+      trust: share of the KL bound that the next update may use; it falls after a step back.
+      restart: when the policy was started anew, and what was kept by then; None: it was not.
+      estimate: the last utility estimate; None before the first.
+      bound: the last decision on the KL bound; None before the first.
+      iteration: iterations completed.
+      trajectories: all of them, by number.
+      clips: first step and number of steps of the part of each that questions are about; () where they are about all.
+      preferences: the answers so far.
+      collected: whether the next iteration's trajectories are among them.
+      candidates: trajectories to ask about in this iteration, best first.
+      opponents: whom some of them are compared with; the newest undominated trajectory where it names none.
+      information: what the answer about the first of them was expected to tell, nats; None where that is unknown.
+      wanted: number of answers still wanted in this iteration.
+      unasked: number of consecutive iterations, up to now, without a question.
+      open: the questions that wait for an answer, in the order in which they were asked; where one person answers, one
+        at most.
+      queries: number of questions so far.
+      past: the questions so far that were answered.
+      shown: the trajectories that were shown in some question.
+      summaries: one for each completed iteration.
+      before: the states before the last answers, at most `MOST_UNDONE`, the newest last; they have none themselves.
+    """
+
+    policy: Any
+    first_policy: Any = None
+    best_policy: Any = None
+    best: int = 0
+    kept: int = 0
+    tried: tuple[Trajectory, ...] = ()
+    best_tried: tuple[Trajectory, ...] = ()
+    trust: float = 1.0
+    restart: Restart | None = None
+    estimate: UtilityEstimate | None = None
+    bound: Bound | None = None
+    iteration: int = 0
+    trajectories: tuple[Trajectory, ...] = ()
+    clips: tuple[tuple[int, int], ...] = ()
+    preferences: Preferences = field(default_factory=Preferences)
+    collected: bool = False
+    candidates: tuple[int, ...] = ()
+    opponents: Mapping[int, int] = field(default_factory=dict)
+    information: float | None = None
+    wanted: int = 0
+    unasked: int = 0
+    open: tuple[Query, ...] = ()
+    queries: int = 0
+    past: tuple[PastQuestion, ...] = ()
+    shown: frozenset[int] = frozenset()
+    summaries: tuple[Mapping[str, Any], ...] = ()
+    before: tuple["LearnerState", ...] = field(default=(), repr=False)
+
+    def finished(self, settings: Settings) -> bool:
+        """Whether a run with these settings ends here: after an iteration, not within one."""
+        restart = None if self.restart is None else self.restart.iteration
+        return not self.collected and settings.finished(self.iteration, self.preferences.answers, self.unasked, restart)
+
+    def restarts(self, settings: Settings) -> bool:
+        """Whether the next trajectories follow the first policy again."""
+        return self.restart is None and settings.restarts(self.iteration, self.preferences.answers, self.unasked)
+
+    @property
+    def started(self) -> int:
+        """Iterations completed when the present policy was started."""
+        return 0 if self.restart is None else self.restart.iteration
+
+    @property
+    def query(self) -> Query | None:
+        """The question that has waited longest for an answer; None if none does."""
+        return self.open[0] if self.open else None
+
+    @property
+    def previous(self) -> "LearnerState | None":
+        """The state before the last answer; None where no answer can be taken back."""
+        return replace(self.before[-1], before=self.before[:-1]) if self.before else None
+
+    @property
+    def compared(self) -> tuple[Trajectory, ...]:
+        """What questions are about, by the numbers of the trajectories: the trajectories, or a part of each."""
+        return clips_of(self.trajectories, self.clips or None)
+
+    @property
+    def kept_policy(self) -> Any:
+        """The policy number `kept`."""
+        if self.restart is not None and self.kept == self.restart.number:
+            return self.restart.policy
+        return self.policy if self.kept == self.iteration else self.best_policy
+
+    @property
+    def kept_tried(self) -> tuple[Trajectory, ...]:
+        """Trajectories of the policy number `kept` without its noise; () where it was not tried."""
+        if self.restart is not None and self.kept == self.restart.number:
+            return self.restart.tried
+        return self.tried if self.kept == self.iteration else self.best_tried
