@@ -63,3 +63,10 @@ def test_gains_are_counted_by_what_the_schedule_said():
     assert np.all(gain_calibration([], "signal")["updates"] == 0)
     with pytest.raises(ValueError, match="edges: expected"):
         gain_calibration(runs, edges=(1, 0))
+    restarted = [
+        {"iteration": 1, "value_newest": 5.0},
+        {"iteration": 2, "value_newest": 1.0, "schedule": {"agreement": 0.99}, "restarted": 1},  # no update of the last
+        {"iteration": 3, "value_newest": 2.0, "schedule": {"agreement": 0.98}, "restarted": 1},
+    ]
+    result = gain_calibration([restarted], edges=(0, 1))
+    np.testing.assert_allclose([result["updates"], result["gained"], result["stated"]], [[1], [1.0], [0.98]])

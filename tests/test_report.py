@@ -162,6 +162,17 @@ def test_the_summary_has_the_value_and_the_convergence_of_the_posterior(page, co
     assert f"is {number(last['value'])}" in page.text
     assert f"largest R̂ {last['rhat_max']:.3f}" in page.text
     assert f"satisfies {last['pairs_satisfied']} of {last['pairs']} preferences" in page.text
+    assert "anew" not in page.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kept", "of"), [(1, "the earlier one of iteration 1"), (3, "the one of iteration 3")])
+def test_the_report_says_that_a_policy_was_started_anew_and_which_is_kept(contents, kept, of):
+    report = assembled(changed(contents, [{}, {}, {"restarted": 2, "kept": kept}]))
+    said = f"After iteration 2 a policy was started anew with the last posterior; the run keeps {of}."
+    assert said in report.summary
+    (learning,) = [section for section in report.sections if section.name == "learning"]
+    assert "begins again where a policy was started anew" in str(learning.blocks)
 
 
 def test_every_answer_is_drawn_with_both_trajectories_and_its_probability(page, contents):

@@ -20,7 +20,7 @@ def summary(
     if not iterations.sizes["iteration"]:
         given = count(len(contents.answers), "answer has", "answers have")
         return [f"Nothing has been learnt yet: no iteration is completed, {given} been given."]
-    sentences = [_value(contents, iterations), _convergence(contents)]
+    sentences = [_value(contents, iterations), *_restart(contents), _convergence(contents)]
     quality = None if contents.estimate is None else contents.estimate.quality
     if quality is not None and quality.pairs:
         satisfied = f"{quality.pairs_satisfied} of {count(quality.pairs, 'preference')}"
@@ -49,6 +49,18 @@ def _value(contents: RunContents, iterations: xr.Dataset) -> str:
         return f"{text}it has never been better."
     same = number(value[best]) == number(value[-1])
     return text + (f"it was already as good {when}." if same else f"the best was {number(value[best])} {when}.")
+
+
+def _restart(contents: RunContents) -> Iterator[str]:
+    """Since when a policy that was started anew is updated, and which one the run keeps."""
+    last = contents.iterations[-1]
+    restart, kept = last.get("restarted"), last.get("kept")
+    if isinstance(restart, int) and isinstance(kept, int):
+        of = "the one" if kept > restart else "the earlier one"
+        yield (
+            f"After iteration {restart} a policy was started anew with the last posterior; the run keeps {of} of "
+            f"iteration {kept}."
+        )
 
 
 def _convergence(contents: RunContents) -> str:
