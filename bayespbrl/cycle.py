@@ -80,7 +80,7 @@ class Cycle:
             return self.improve(state)
         if others:
             room = self.settings.questions.left(state.preferences.answers)
-            if state.iteration + 1 >= self.settings.most_iterations:
+            if state.iteration + 1 >= self.settings.last_iteration(state.started):
                 room = min(room, state.wanted)
             if room <= others or not newcomers:
                 return None

@@ -167,9 +167,10 @@ def test_iterations_follow_from_the_budget_of_answers():
     restarts = [restarted.restarts(8, 5, 9), restarted.restarts(2, 6, 0), restarted.restarts(8, 3, 10)]
     assert (*restarts, restarted.restarts(9, 5, 0)) == (False, True, True, True)
     assert not restarted.finished(iteration=9, answers=6, unasked=5)
-    assert not restarted.finished(iteration=9, answers=6, unasked=9, restart=2)
-    assert restarted.finished(iteration=10, answers=6, unasked=9, restart=2)
-    assert restarted.finished(iteration=17, answers=5, unasked=0, restart=10)
+    assert not restarted.finished(iteration=9, answers=6, unasked=9, started=2)
+    assert restarted.finished(iteration=10, answers=6, unasked=9, started=2)
+    assert restarted.finished(iteration=17, answers=5, unasked=0, started=10)
+    assert [restarted.last_iteration(started) for started in (0, 2, 9, 12)] == [17, 10, 17, 17]
 
     given = settings_for("SomebodysEnv-v3", answers=6, iterations=20)  # as many iterations as the user said
     assert not given.restarts(iteration=12, answers=6, unasked=4)

@@ -93,8 +93,8 @@ class LearnerState:
 
     def finished(self, settings: Settings) -> bool:
         """Whether a run with these settings ends here: after an iteration, not within one."""
-        restart = None if self.restart is None else self.restart.iteration
-        return not self.collected and settings.finished(self.iteration, self.preferences.answers, self.unasked, restart)
+        done = (self.iteration, self.preferences.answers, self.unasked)
+        return not self.collected and settings.finished(*done, self.started)
 
     def restarts(self, settings: Settings) -> bool:
         """Whether the next trajectories follow the first policy again."""

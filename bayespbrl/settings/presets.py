@@ -119,7 +119,6 @@ PEOPLE: dict[str, Any] = {
     "repeats": 0.1,  # a simulated expert would only repeat itself
     "unasked_iterations": 0,  # a person waits for them
     "evaluation_episodes": 20,  # and for these
-    "restart_iterations": 0,  # and for these
     "worthwhile": False,  # the page says what an answer is worth, and leaves it to the person to stop
 }
 

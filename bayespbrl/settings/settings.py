@@ -208,19 +208,21 @@ class Settings:
             return False
         return answers >= budget or unasked >= MOST_UNASKED or iteration >= self.most_iterations - self._restarted
 
-    def finished(self, iteration: int, answers: int, unasked: int, restart: int | None = None) -> bool:
+    def last_iteration(self, started: int = 0) -> int:
+        """After which a run ends in any case; `started` as of `finished`."""
+        return min(self.most_iterations, started + self._restarted) if started else self.most_iterations
+
+    def finished(self, iteration: int, answers: int, unasked: int, started: int = 0) -> bool:
         """Whether a run ends.
 
         Args:
           iteration, answers: completed and given.
           unasked: iterations in a row without a question.
-          restart: iterations completed when the policy was started anew; None: it was not.
+          started: iterations completed when the policy was started anew; 0: it was not.
         """
-        if iteration >= self.most_iterations:
+        if iteration >= self.last_iteration(started):
             return True
-        if self._restarted:
-            return restart is not None and iteration >= restart + self._restarted
-        if self.questions.answers is None:
+        if self._restarted or self.questions.answers is None:
             return False
         return unasked >= (LAST_ITERATIONS if answers >= self.questions.answers else MOST_UNASKED)
 

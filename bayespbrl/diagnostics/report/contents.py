@@ -68,8 +68,8 @@ class RunContents:
         """Whether all iterations are completed."""
         answers = [summary.get("answers", 0) for summary in self.iterations]  # none in a damaged summary
         unasked = next((n for n, before in enumerate(reversed(answers[:-1])) if before != answers[-1]), 0)
-        restart = self.iterations[-1].get("restarted") if self.iterations else None
-        return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked, restart)
+        started = self.iterations[-1].get("restarted", 0) if self.iterations else 0
+        return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked, started)
 
     @property
     def compared(self) -> Mapping[int, Trajectory]:
