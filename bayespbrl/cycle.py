@@ -69,19 +69,20 @@ class Cycle:
         Args:
           answerer: of several people, one without a question, who is asked next.
           others: at how many questions the others are looking; None: only one person answers. No more is asked than
-            the budget has left, and in the last iteration no more than it wants. Then the result is None too.
+            the budget has left, and in the last iteration no more than it wants, which ends when they have answered.
+            Then the result is None too.
         """
         if state.finished(self.settings) or (others is None and state.open):
             return None
         if not state.collected:
             return self.collect(state)
         newcomers = self._newcomers(state)
+        last = state.iteration + 1 >= self.settings.last_iteration(state.started)
         if not state.wanted or not (newcomers or others):
-            return self.improve(state)
+            return None if last and others else self.improve(state)
         if others:
             room = self.settings.questions.left(state.preferences.answers)
-            if state.iteration + 1 >= self.settings.last_iteration(state.started):
-                room = min(room, state.wanted)
+            room = min(room, state.wanted) if last else room
             if room <= others or not newcomers:
                 return None
         return self.show(state, answerer)
@@ -143,7 +144,7 @@ class Cycle:
 
     def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> questions.Chosen:
         options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)
-        favourite = state.best if state.restart is None else state.restart.number
+        favourite = state.best if state.restart is None else min(state.restart.number, state.started - 1)
         new, best = range(len(state.trajectories), len(known)), self._of_iteration(favourite)
         opponents = opponents_from_the_same_start(known, state.preferences, best) if options.same_start else {}
         if state.estimate is None:

@@ -108,7 +108,10 @@ class Learner:
 
     @property
     def policy(self) -> Any:
-        """The policy that the posterior thinks best of those tried, without its noise; else the newest, with it."""
+        """The policy that the posterior thinks best of those tried, without its noise; else the newest, with it.
+
+        One that was started anew replaces the policy before it only where it is clearly better.
+        """
         tried = self.state.tried or self.state.restart is not None
         return greedy(self.state.kept_policy) if tried else self.state.kept_policy
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bayespbrl.events import Entry, LearnerState, apply, plain, replay, surviving
+from bayespbrl.events import Entry, LearnerState, Restart, apply, plain, replay, surviving
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.trajectories import Trajectory
 
@@ -104,6 +104,23 @@ def test_the_fold_changes_nothing_that_it_is_given():
         assert entry.event == event
         assert apply(state, entry).preferences == after.preferences
         state = after
+
+
+def test_a_policy_is_started_anew_once_and_what_was_kept_is_remembered():
+    anew = collected(3, [5], seed=2)
+    anew = dataclasses.replace(anew, event={**anew.event, "restarted": True})
+    begun = dataclasses.replace(START, first_policy="policy 0")
+    state = replay(begun, (*HISTORY, anew))
+    assert (state.policy, state.started, state.best, state.tried, state.trust) == ("policy 0", 2, 2, (), 1.0)
+    assert (state.kept, state.kept_policy, state.restart) == (2, "policy 2", Restart(2, 2, "policy 2", ()))
+    checked = {"check": {"best": 2, "trust": 1.0}}
+    for kept, policy in ((3, "policy 3"), (2, "policy 2")):
+        update = improved(3)
+        update.event["summary"].update(checked, kept=kept)
+        assert apply(state, update).kept_policy == policy
+    for history in ((anew,), (*HISTORY, anew, improved(3), anew)):
+        with pytest.raises(ValueError, match="collected: expected a policy to be started anew once"):
+            replay(begun, history)
 
 
 @pytest.mark.parametrize("length", range(3, len(HISTORY) + 1))

@@ -172,7 +172,7 @@ def test_the_report_says_that_a_policy_was_started_anew_and_which_is_kept(conten
     said = f"After iteration 2 a policy was started anew with the last posterior; the run keeps {of}."
     assert said in report.summary
     (learning,) = [section for section in report.sections if section.name == "learning"]
-    assert "begins again where a policy was started anew" in str(learning.blocks)
+    assert "begins again where a policy was started anew; the last" in str(learning.blocks)
 
 
 def test_every_answer_is_drawn_with_both_trajectories_and_its_probability(page, contents):

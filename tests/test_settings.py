@@ -164,8 +164,11 @@ def test_iterations_follow_from_the_budget_of_answers():
 
     restarted = settings_for("SomebodysEnv-v3", answers=6)
     assert restarted.most_iterations == 17
-    restarts = [restarted.restarts(8, 5, 9), restarted.restarts(2, 6, 0), restarted.restarts(8, 3, 10)]
+    restarts = [restarted.restarts(8, 5, 9), restarted.restarts(5, 6, 0), restarted.restarts(8, 3, 10)]
     assert (*restarts, restarted.restarts(9, 5, 0)) == (False, True, True, True)
+    assert not restarted.restarts(4, 6, 1)
+    few = settings_for("SomebodysEnv-v3", answers=1)
+    assert (few.most_iterations, few.restarts(4, 1, 3), few.restarts(5, 1, 4)) == (13, False, True)
     assert not restarted.finished(iteration=9, answers=6, unasked=5)
     assert not restarted.finished(iteration=9, answers=6, unasked=9, started=2)
     assert restarted.finished(iteration=10, answers=6, unasked=9, started=2)

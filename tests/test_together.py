@@ -150,6 +150,24 @@ def test_whoever_goes_away_holds_nobody_up_and_their_question_is_taken(sitting, 
         ada.answer(turn, "first")
 
 
+def test_what_follows_the_last_answer_is_done_though_everybody_has_left(sitting, tmp_path, monkeypatch):
+    monkeypatch.setattr("bayespbrl.people.seat.AWAY", 0.0)
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", answers=2, **LONGER)
+    session, (ada, ada_leaves), (ben, ben_leaves) = sitting(learner)
+    settled(session)
+    ada.answer(ada.view["turn"], "first")
+    settled(session)
+    last = next(seat for seat in (ada, ben) if seat.view["phase"] == QUESTION)
+    with session.changed:  # nothing is computed in between
+        ada_leaves()
+        ben_leaves()
+        last.answer(last.view["turn"], "second")
+        assert not learner.finished
+    ada.wait((FINISHED, FAILED), WAIT)
+    assert learner.finished
+    assert learner.state.iteration > 1
+
+
 def test_what_a_killed_program_leaves_is_asked_again_of_the_same_people(sitting, tmp_path):
     session, (ada, _), (ben, _) = sitting()
     for seat in (ada, ben, ada):

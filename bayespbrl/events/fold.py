@@ -93,6 +93,8 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     if not preferences.undominated and opponents is None:
         preferences, candidates = preferences.start(candidates[0]), candidates[1:]
     if event.get("restarted", False):
+        if state.restart is not None or not state.kept:
+            raise ValueError(f"collected: expected a policy to be started anew once, got {event['iteration']}")
         kept = Restart(state.iteration, state.kept, state.kept_policy, state.kept_tried)
         state = replace(
             state,

@@ -31,7 +31,7 @@ class LearnerState:
     """What the learner knows between two calls.
 
     Attributes:
-      policy: the newest policy, which the next trajectories follow.
+      policy: the newest policy, which the next trajectories follow unless the policy is started anew.
       first_policy: the one that a policy started anew begins with.
       best_policy: where updates are checked, the one that the posterior thinks best of the policies before the newest;
         the next update starts there after a step back.

@@ -55,7 +55,7 @@ def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, tru
 
 
 def clearly_better(utility: UtilityEstimate, tried: Sequence[Trajectory], kept: Sequence[Trajectory]) -> bool:
-    """Whether a policy that nobody is asked about replaces the one that is kept.
+    """Whether a policy that was started anew, about which hardly anything is asked, replaces the one that is kept.
 
     It does where `CLEARLY` of the draws prefer its trajectories to the kept policy's from the same starts; without a
     posterior, where the estimate does.

@@ -95,7 +95,9 @@ class Foresight:
     def _next(self, moment: Moment) -> Entry | None:
         if not self.several:
             return self.cycle.next(moment.state)
-        held = len(moment.holders)
+        held, left = len(moment.holders), self._left(moment)
+        if not held and left <= 0:  # what follows the last answer needs nobody
+            return self.cycle.next(moment.state, None, others=0)
         free = [name for name in self.people if name not in moment.holders.values()]
         if not free or (self.most is not None and 0 < held >= self.most - moment.state.preferences.answers):
             return None
@@ -156,9 +158,14 @@ class Foresight:
                 holders[query.number] = query.answerer if query.answerer in free else free[0]
         return holders
 
+    def _left(self, moment: Moment) -> float:
+        """Answers of the budget."""
+        return self.cycle.settings.questions.left(moment.state.preferences.answers)
+
     def _ahead(self) -> Iterator[Moment]:
         """The moments after each answer, and those after two likely ones.
 
+        Not what follows the last answer of the budget, which no question waits for: that is the most of all.
         The last answer is a tie where the run has none yet. It comes at the end then: seconds of compilation follow.
         """
         following, questions = list(self._after(self.present, len(Answer))), len(self.present.holders)
@@ -176,4 +183,5 @@ class Foresight:
             if (number, answer) not in moment.after:
                 state = events.apply(moment.state, events.answered(number, answer, answerer=who))
                 moment.after[number, answer] = self._following(moment, state, moment.holders)
-            yield moment.after[number, answer]
+            if self._left(moment.after[number, answer]) > 0:
+                yield moment.after[number, answer]

@@ -252,7 +252,7 @@ function render({ model, el }) {
   }
 
   function hear(message) {
-    if (message.connection === "lost") warn(LOST);
+    if (message.connection === "lost" && note.hidden) warn(LOST);
     if (message.connection === "gone") { lock(true); warn(message.say); }
     if (message.connection === "back" && note.textContent === LOST) warn(null);
     if (message.refused === undefined || message.refused !== answered) return;

@@ -32,8 +32,8 @@ async function post(message) {
       fire("msg:custom", { refused: message.turn, say: reply.status === 409 ? ELSEWHERE : await reply.text() });
       return;
     } catch {
-      fire("msg:custom", { connection: "lost" });
       if (ended()) return;
+      fire("msg:custom", { connection: "lost" });
       await pause(500);
     }
   }

@@ -14,6 +14,7 @@ from bayespbrl.learner import Learner
 from bayespbrl.models.likelihoods import Likelihood, prob
 from bayespbrl.people.clips import Clip
 from bayespbrl.preferences import Answer, Query
+from bayespbrl.settings import MOST_UNASKED
 from bayespbrl.utility.posterior_utility import PosteriorUtility
 
 View = Mapping[str, Any]
@@ -115,7 +116,8 @@ def ending(learner: Learner, state: LearnerState, given: int) -> str:
         return f"These were the {given} answers of this sitting. Thank you! The run can go on later."
     if budget is not None and answers >= budget:
         return f"All {answers} answers are given, and the policy has caught up with them. Thank you!"
-    if state.iteration >= learner.settings.most_iterations:
+    restarted = state.restart is not None and state.unasked < MOST_UNASKED  # and asked again
+    if restarted or state.iteration >= learner.settings.most_iterations:
         return f"The run has done its {state.iteration} iterations, with {answers} answers. Thank you!"
     return (
         f"The learner can foresee your answers: none was worth {LITTLE:.2f} bit in the last {state.unasked} "

@@ -190,7 +190,9 @@ class Settings:
         budget = self.questions.answers
         if self.iterations is None:
             assert budget is not None
-            return 3 * budget // 2 + (self._restarted or LAST_ITERATIONS)
+            if self._restarted:
+                return max(3 * budget // 2, LAST_ITERATIONS) + self._restarted
+            return 3 * budget // 2 + LAST_ITERATIONS
         return self.iterations
 
     @property
@@ -201,10 +203,11 @@ class Settings:
     def restarts(self, iteration: int, answers: int, unasked: int) -> bool:
         """Whether the policy is started anew, because the answers have said what they can; arguments as of `finished`.
 
-        Decision: at once after the last answer, since nobody is asked about what the first policy does then.
+        Decision: at once after the last answer, since nobody is asked about what the first policy does then, but not
+        before it had as many iterations as a run without a second policy ends with.
         """
         budget = self.questions.answers
-        if not self._restarted or budget is None:
+        if not self._restarted or budget is None or iteration < LAST_ITERATIONS:
             return False
         return answers >= budget or unasked >= MOST_UNASKED or iteration >= self.most_iterations - self._restarted
 

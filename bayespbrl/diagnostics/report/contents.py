@@ -68,8 +68,13 @@ class RunContents:
         """Whether all iterations are completed."""
         answers = [summary.get("answers", 0) for summary in self.iterations]  # none in a damaged summary
         unasked = next((n for n, before in enumerate(reversed(answers[:-1])) if before != answers[-1]), 0)
-        started = self.iterations[-1].get("restarted", 0) if self.iterations else 0
-        return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked, started)
+        return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked, self.started)
+
+    @property
+    def started(self) -> int:
+        """Iterations completed when the policy was started anew; 0: it was not."""
+        started = self.iterations[-1].get("restarted") if self.iterations else None
+        return started if type(started) is int and 0 < started <= len(self.iterations) else 0
 
     @property
     def compared(self) -> Mapping[int, Trajectory]:

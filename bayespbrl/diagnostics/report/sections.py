@@ -60,8 +60,10 @@ def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
             "Where the interval is below zero, the policy has become better since, by this utility. Where it is flat "
             "and contains zero, nothing more was gained. Whether the gain is real, the trajectories show."
         )
-        if "restarted" in contents.iterations[-1]:
-            caption += " It begins again where a policy was started anew."
+        if contents.started:
+            caption += (
+                " It begins again where a policy was started anew; the last iteration is of that policy, kept or not."
+            )
         alt = "The inferred utility of each iteration's trajectories."
         blocks.append(drawn("progress", curve, caption, alt, size=(7.6, 3.0)))
     return [], blocks

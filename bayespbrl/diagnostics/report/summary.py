@@ -53,13 +53,12 @@ def _value(contents: RunContents, iterations: xr.Dataset) -> str:
 
 def _restart(contents: RunContents) -> Iterator[str]:
     """Since when a policy that was started anew is updated, and which one the run keeps."""
-    last = contents.iterations[-1]
-    restart, kept = last.get("restarted"), last.get("kept")
-    if isinstance(restart, int) and isinstance(kept, int):
-        of = "the one" if kept > restart else "the earlier one"
+    kept = contents.iterations[-1].get("kept")
+    if contents.started and isinstance(kept, int):
+        of = "the one" if kept > contents.started else "the earlier one"
         yield (
-            f"After iteration {restart} a policy was started anew with the last posterior; the run keeps {of} of "
-            f"iteration {kept}."
+            f"After iteration {contents.started} a policy was started anew with the last posterior; the run keeps {of} "
+            f"of iteration {kept}."
         )
 
 

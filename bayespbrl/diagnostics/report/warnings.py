@@ -108,7 +108,8 @@ def _of_value(table: xr.Dataset) -> Iterator[ReportWarning]:
         best = int(np.argmax(value))
         yield ReportWarning(
             f"The value has fallen from {number(value[best])} (iteration {best + 1}) to {number(value[-1])}.",
-            "Either the evaluation is noisy or an update was too large: look at the KL, and try a smaller --kl-bound.",
+            "Either the evaluation is noisy, an update was too large (look at the KL, and try a smaller --kl-bound), "
+            "or the posterior is wrong about a policy that no answer is about: more answers help.",
         )
 
 
