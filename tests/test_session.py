@@ -2,6 +2,7 @@
 
 import io
 import sys
+import time
 from unittest import mock
 
 import gymnasium
@@ -23,7 +24,7 @@ from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session, answer_of
-from bayespbrl.people.views import FINISHED, QUESTION, with_ties
+from bayespbrl.people.views import ALL_GIVEN, FINISHED, QUESTION, THINKING, with_ties
 from bayespbrl.people.widget import ComparisonWidget
 from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.lock import continuing
@@ -125,6 +126,18 @@ def test_nothing_reaches_the_log_before_the_answer(sitting, tmp_path):
     with session.changed:
         assert session.changed.wait_for(lambda: len(moment.after) > 1, WAIT)
     assert learner.log.log_file.read_bytes() == before
+
+
+def test_after_the_last_answer_nobody_needs_to_wait_and_nothing_is_computed_ahead(sitting):
+    session, views = sitting(bayespbrl.Learner("gridworld", expert="other", answers=1, **QUICK)), []
+    session.listen(lambda: views.append(session.view))
+    session.wait(timeout=WAIT)
+    while not session.idle:
+        time.sleep(0.01)
+    assert all(after.complete == (answer == "skip") for (_, answer), after in session._foresight.present.after.items())
+    session.answer(1, "first", 2.0)
+    assert session.wait((FINISHED,), WAIT)["say"].startswith("All 1 answers are given")
+    assert {view["say"] for view in views if view["phase"] == THINKING} == {ALL_GIVEN}
 
 
 def test_a_turn_takes_one_answer_and_an_undo_is_a_turn_of_its_own(sitting):

@@ -200,7 +200,7 @@ function render({ model, el }) {
       lock(true);
       const thinking = view.phase === "thinking" || !view.phase;
       find(".bp-learner").textContent = thinking && view.iteration ? `${view.iteration} iterations of the policy are done.` : "";
-      say(thinking ? "Thinking…" : view.say);
+      say(view.say || "Thinking…");
       return;
     }
     if (loaded !== view.turn) {

@@ -34,6 +34,7 @@ class Shown:
 
 
 NOTHING_LEFT = "Others are answering the last questions. Wait, in case one of them leaves, or close this page."
+ALL_GIVEN = "All answers are given, thank you! You need not wait while the learner finishes."
 # The answers, the likeliest first, where nothing is known. After a skip there is little to compute.
 UNKNOWN: tuple[Answer, ...] = (Answer.FIRST, Answer.SECOND, Answer.SKIP, Answer.TIE)
 NOTHING_SAID: View = {"worth": None, "sure": None, "advice": ""}
@@ -41,6 +42,7 @@ NOTHING_SAID: View = {"worth": None, "sure": None, "advice": ""}
 
 def described(learner: Learner, state: LearnerState, phase: str, *, turn: int, answerer: str | None) -> dict[str, Any]:
     """A view of a phase without a question: the run, and who answers."""
+    given_all = learner.settings.questions.left(state.preferences.answers) <= 0
     return {
         "phase": phase,
         "turn": turn,
@@ -52,7 +54,7 @@ def described(learner: Learner, state: LearnerState, phase: str, *, turn: int, a
         "answerer": answerer,
         "practice": None,
         "notice": "",
-        "say": "",
+        "say": ALL_GIVEN if given_all and phase == THINKING else "",
     }
 
 
