@@ -127,14 +127,13 @@ class Chains:
     def with_references(self, fits: Sequence[GaussianFit], values: Mapping[str, float]) -> "Chains":
         """The same chains with the references of other fits, which were made at these values of the unknowns."""
         rank = max(fit.factors.loadings.shape[1] for fit in fits)
-        settings = stacked(
-            [_with_reference(fit, rank, power) for fit, power in zip(fits, self._powers(fits), strict=True)]
-        )
+        powers = self._powers(fits) if self.many else [REFERENCE_POWER] * len(fits)
+        settings = stacked([_with_reference(fit, rank, power) for fit, power in zip(fits, powers, strict=True)])
         fitted = None if self.problem.fitted_steepness is None else values["steepness"]
         return replace(self, problem=self.problem._replace(settings=settings, fitted_steepness=fitted))
 
     def _powers(self, fits: Sequence[GaussianFit]) -> list[float]:
-        """The power of each fit's Gaussian factors at which it is as wide as the last half of the draws."""
+        """The power of each fit's Gaussian factors at which it is as wide as the last half of many answers' draws."""
         half = self.length // 2
         z, setting = (self.collected(name, self.length)[:, half:] for name in ("coordinates", "setting"))
         powers = []

@@ -69,17 +69,23 @@ def fit_gaussian(
 
 
 def refitted(
-    fit: GaussianFit, model: PreferenceModel, number_of_preferences: int, tied: ArrayLike | None
+    fit: GaussianFit,
+    model: PreferenceModel,
+    number_of_preferences: int,
+    tied: ArrayLike | None,
+    *,
+    widening: bool,
 ) -> GaussianFit:
     """The same factorisation and likelihood with the Gaussian of another model, in which nothing is left to infer.
 
-    For many answers: the factor of a violated answer may widen the Gaussian, where that converges.
+    `widening` is for many answers: the factor of a violated answer may widen the Gaussian, where that converges.
     """
     likelihood = model.answer_likelihood(number_of_preferences, tied)
     with one_blas_thread():
         approximation = None
-        with suppress(np.linalg.LinAlgError):  # wider than the prior allows
-            approximation = _approximation(fit.factors, likelihood, model.prior_scale, widening=True)
+        if widening:
+            with suppress(np.linalg.LinAlgError):  # wider than the prior allows
+                approximation = _approximation(fit.factors, likelihood, model.prior_scale, widening=True)
         if approximation is None or not approximation.converged:
             approximation = _approximation(fit.factors, likelihood, model.prior_scale)
         return replace(fit, approximation=approximation)

@@ -14,7 +14,7 @@ from bayespbrl.models.chains import CHUNK, LEAST_LAPSES, Chains
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.evidence import log_evidence
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, one_blas_thread, refitted
-from bayespbrl.models.likelihoods import has_steps
+from bayespbrl.models.likelihoods import WithTies, has_steps
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
 
@@ -142,11 +142,7 @@ def posterior_draws(
             by_answerer=answers.by_answerer(settings.shape[1]),
         )
         chains = chains.extended(sampler.num_warmup)
-        if (
-            chains.many
-            and chains.draws
-            and (None in (model.steepness, model.lapse_rate) or has_steps(fits[0].likelihood))
-        ):
+        if chains.draws and _needs_better_references(chains, fits[0], model):
             chains = _with_better_references(chains, fits, model, answers, number).extended(sampler.num_warmup)
         chains = replace(chains, draws=())
         wanted = sampler.num_samples
@@ -161,16 +157,27 @@ def posterior_draws(
     return posterior_tree(fits, chains, wanted, report, attributes, np.asarray(differences), answers)
 
 
+def _needs_better_references(chains: Chains, fit: GaussianFit, model: PreferenceModel) -> bool:
+    """Whether references at the prior's means are far from the posterior.
+
+    Those of many answers are, and those of ties: under a threshold that is much smaller than expected, weights that are
+    moved from one setting to another no longer leave the margins of ties within it.
+    """
+    unknown = None in (model.steepness, model.lapse_rate) or has_steps(fit.likelihood)
+    return unknown if chains.many else isinstance(fit.likelihood, WithTies) and model.tie_threshold is None
+
+
 def _with_better_references(
     chains: Chains, fits: Sequence[GaussianFit], model: PreferenceModel, answers: Answers, number: int
 ) -> Chains:
-    """The chains with references fitted at the means of their draws so far: of many answers few values are likely."""
+    """The chains with references fitted at the means of their draws so far."""
     means = chains.means()
     steepness = means["steepness"] if model.steepness is None else model.steepness
     lapse_rate = max(means["lapse_rate"], LEAST_LAPSES) if model.lapse_rate is None else model.lapse_rate
     threshold = means["tie_threshold"] if answers.indifferent is not None else model.tie_threshold
     given = replace(model, steepness=steepness, lapse_rate=lapse_rate, tie_threshold=threshold)
-    return chains.with_references([refitted(fit, given, number, answers.indifferent) for fit in fits], means)
+    them = [refitted(fit, given, number, answers.indifferent, widening=chains.many) for fit in fits]
+    return chains.with_references(them, means)
 
 
 def _diagnosed(
