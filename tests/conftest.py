@@ -53,8 +53,11 @@ def pytest_runtest_setup():
     calls.clear()
 
 
+LONGEST = {"test_readme.py", "test_notebooks.py"}  # begun first, so that no process works on while the others are done
+
+
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: item.get_closest_marker("empties_caches") is not None)
+    items.sort(key=lambda item: (item.get_closest_marker("empties_caches") is not None, item.path.name not in LONGEST))
 
 
 # What the modules with checked shapes import. Imported first, else it would be compiled from its source: while it loads

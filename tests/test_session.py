@@ -136,7 +136,7 @@ def test_after_the_last_answer_nobody_needs_to_wait_and_nothing_is_computed_ahea
         time.sleep(0.01)
     assert all(after.complete == (answer == "skip") for (_, answer), after in session._foresight.present.after.items())
     session.answer(1, "first", 2.0)
-    assert session.wait((FINISHED,), WAIT)["say"].startswith("All 1 answers are given")
+    assert session.wait((FINISHED,), WAIT)["say"].startswith("Your answer is given")
     assert {view["say"] for view in views if view["phase"] == THINKING} == {ALL_GIVEN}
 
 

@@ -115,9 +115,11 @@ def ending(learner: Learner, state: LearnerState, given: int) -> str:
     """Why there is no further question, after so many answers of a sitting."""
     answers, budget = state.preferences.answers, learner.settings.questions.answers
     if not state.finished(learner.settings):
-        return f"These were the {given} answers of this sitting. Thank you! The run can go on later."
+        these = f"These were the {given} answers" if given != 1 else "This was the one answer"
+        return f"{these} of this sitting. Thank you! The run can go on later."
     if budget is not None and answers >= budget:
-        return f"All {answers} answers are given, and the policy has caught up with them. Thank you!"
+        given_all = f"All {answers} answers are given, and the policy has caught up with them. Thank you!"
+        return given_all if answers > 1 else "Your answer is given, and the policy has caught up with it. Thank you!"
     restarted = state.restart is not None and state.unasked < MOST_UNASKED  # and asked again
     if restarted or state.iteration >= learner.settings.most_iterations:
         return f"The run has done its {state.iteration} iterations, with {answers} answers. Thank you!"
