@@ -142,7 +142,7 @@ def test_the_gaussian_of_many_contradicting_answers_is_as_wide_as_their_posterio
     rows = answers(200, seed=6, wrong=0.1)
     model = PreferenceModel(1.0, 5.0, 0.2)
     fit = fit_gaussian(rows, model)
-    wider = refitted(fit, model, len(rows), None)
+    wider = refitted(fit, model, len(rows), None, widening=True)
     density = log_density(rows, "mixed", 5.0, 0.2)
     mass = np.exp(density - density.max())
     points = POINTS[rng.choice(len(POINTS), 4000, p=mass / mass.sum())] @ fit.factors.basis
