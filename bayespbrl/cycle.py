@@ -22,6 +22,7 @@ from bayespbrl.improvement.check import Check, checked, clearly_better
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
+from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.policies import greedy
 from bayespbrl.preferences import opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
@@ -60,6 +61,7 @@ class Cycle:
         if steps is not None and steps > (limit := rollouts.step_limit(self.environment, options.max_steps)):
             raise ValueError(f"clip_steps: expected at most {limit}, the steps of an episode, got {steps}")
 
+    @one_blas_thread()
     def next(self, state: LearnerState, answerer: str | None = None, *, others: int | None = None) -> Entry | None:
         """What happens next without an answer; None where a question waits for one, or the run is finished.
 
@@ -313,12 +315,7 @@ class Cycle:
         problem = UpdateProblem(
             steps,
             utilities,
-            states_of_update(
-                since_start,
-                settings.update,
-                an_iteration=number,
-                rng=self._rng(VISITED, iteration),
-            ),
+            states_of_update(since_start, settings.update, an_iteration=number, rng=self._rng(VISITED, iteration)),
             settings.critic,
             state_action_features,
             self.feature_source.of_states(state.trajectories, settings.features.of_critic, rng=rng),

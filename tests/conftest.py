@@ -1,6 +1,7 @@
 """What the test files share: shapes checked at run time, one thread a process, and finished runs of each kind."""
 
 import functools
+import gc
 import importlib
 import os
 import shutil
@@ -71,6 +72,9 @@ def pytest_sessionstart(session):
             importlib.import_module(name)
         jaxtyping.install_import_hook(CHECKED, "conftest.check_shapes")
 
+
+# An eighth of the time would go to looking for garbage among the objects of JAX's programs.
+gc.set_threshold(100_000, 20, 1_000)
 
 # Test processes run side by side. With one thread each, the linear algebra of one does not wait for that of another.
 threadpool_limits(1)  # here, where NumPy has its threads already

@@ -16,7 +16,7 @@ from bayespbrl.diagnostics import (
 from bayespbrl.models import PreferenceModel, posterior_draws, sample_posterior
 from bayespbrl.models.posterior import SamplerOptions
 
-SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+SAMPLING = {"num_warmup": 100, "num_samples": 400, "max_samples": 400}
 FEW = {"num_warmup": 25, "num_samples": 25, "max_samples": 25}  # where any draws will do
 DIFFERENCES = np.array([[0.9, -0.4], [0.5, 0.8], [-0.2, 0.7]])
 

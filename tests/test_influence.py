@@ -7,7 +7,7 @@ from scipy.special import expit
 from bayespbrl.diagnostics import influence, plot_influence, predictions
 from bayespbrl.models import posterior_draws, sample_posterior
 
-SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+SAMPLING = {"num_warmup": 100, "num_samples": 400, "max_samples": 400}
 FEW = {"num_warmup": 25, "num_samples": 25, "max_samples": 25}  # where any draws will do
 # six answers that agree, and one, the fifth, that contradicts them
 CONTRADICTED = np.array([[0.5, 0.1], [0.4, 0.0], [0.6, -0.1], [0.5, 0.0], [-0.55, 0.05], [0.45, 0.1], [0.5, -0.05]])

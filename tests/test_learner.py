@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 from gymnasium.spaces import Discrete
+from threadpoolctl import threadpool_info, threadpool_limits
 from toys import QUICK, Slope, fingerprint
 
 from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, questions, resume, rollouts, start
@@ -253,6 +254,23 @@ def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
         assert summary["answers"] == last["answers"] + (not sure)
     answers = run.iterations[-1]["answers"]
     assert answers == {0.0: 5, 1.1: 10}.get(threshold, answers)
+
+
+class Threads(Slope):
+    """Notes how many threads the linear algebra has while an iteration is computed."""
+
+    def step(self, action):
+        self.seen = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+        return super().step(action)
+
+
+def test_an_iteration_has_one_thread_of_linear_algebra_and_gives_the_others_back():
+    with threadpool_limits(2, user_api="blas"):
+        before = threadpool_info()
+        learner = Learner(env := Threads(), **QUICK)
+        learner.ask()
+        assert env.seen == {1}
+        assert threadpool_info() == before
 
 
 def test_asking_again_changes_nothing():

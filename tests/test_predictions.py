@@ -8,7 +8,7 @@ from bayespbrl.diagnostics.predictions import held_out_probabilities, refit
 from bayespbrl.models import Answers, PreferenceModel, sample_posterior
 from bayespbrl.models.low_rank import low_rank
 
-SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+SAMPLING = {"num_warmup": 100, "num_samples": 400, "max_samples": 400}
 SAMPLE = ("chain", "draw")
 KNOWN = np.array([[0.8, -0.3, 0.0], [0.2, 0.9, 0.0]])
 ASKED = np.array([[1.0, 0.4, 0.7], [-0.3, 0.5, 0.0], [0.0, 0.0, 1.3], [0.0, 0.0, 0.0], [0.8, -0.3, 0.0]])
@@ -92,9 +92,9 @@ def test_the_opposite_question_has_the_opposite_answer(settings):
 
 @pytest.mark.slow
 def test_each_draw_predicts_by_its_own_setting_steepness_and_lapse_rate():
-    tree = sample_posterior(
-        np.array([KNOWN, 3.0 * KNOWN[:, ::-1]]), steepness=None, lapse_rate=None, likelihood="logistic", **SAMPLING
-    )
+    settings = np.array([KNOWN, 3.0 * KNOWN[:, ::-1]])
+    more = {"num_samples": 1000, "max_samples": 1000}  # so many that every second draw suffices
+    tree = sample_posterior(settings, steepness=None, lapse_rate=None, likelihood="logistic", **more)
     asked = np.array([ASKED, 3.0 * ASKED[:, ::-1]])[:, -1:]  # the first answer again, without any part outside
     drawn = tree["posterior"].dataset.isel(draw=slice(None, None, 2))
     margins = drawn["margins"].values[:, :, 0]

@@ -8,7 +8,7 @@ from scipy.stats import norm
 from bayespbrl.diagnostics import plot_sensitivity, sensitivity
 from bayespbrl.models import sample_posterior
 
-SAMPLING = {"num_warmup": 250, "num_samples": 1000, "max_samples": 1000}
+SAMPLING = {"num_warmup": 100, "num_samples": 400, "max_samples": 400}
 DIFFERENCES = np.array([[0.9, -0.4, 0.0], [0.5, 0.8, 0.0], [0.0, 0.0, 0.0]])
 
 

@@ -1,15 +1,14 @@
 """A posterior's thin factorisation and Gaussian approximation: where sampling begins, and the marginal likelihood."""
 
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from threadpoolctl import ThreadpoolController
 
 from bayespbrl import checks
+from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
 from bayespbrl.models.likelihoods import Likelihood, prob
 from bayespbrl.models.low_rank import LowRank, low_rank, used_rows
@@ -97,18 +96,3 @@ def _approximation(
     used = used_rows(factors.loadings)
     mixture = likelihood.probit_mixture().of(used)
     return expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale, widening=widening)
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController()
-
-
-def one_blas_thread() -> AbstractContextManager[object]:
-    """A context in which BLAS uses one thread.
-
-    NumPy and SciPy bring a BLAS each, whose idle threads spin. From K = 80 on the Gaussian fit would take ten times as
-    long.
-    """
-    context: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
-    return context

@@ -17,12 +17,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
+from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.elliptical_slice import Ellipse
 from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords
 from bayespbrl.models.evidence import log_evidence
-from bayespbrl.models.gaussian_fit import fit_gaussian, one_blas_thread
+from bayespbrl.models.gaussian_fit import fit_gaussian
 from bayespbrl.models.gibbs import conditional
 from bayespbrl.models.likelihoods import log_prob
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of

@@ -10,10 +10,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
+from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.chains import CHUNK, LEAST_LAPSES, Chains
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.evidence import log_evidence
-from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, one_blas_thread, refitted
+from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, refitted
 from bayespbrl.models.likelihoods import WithTies, has_steps
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
