@@ -195,11 +195,6 @@ def named_expert(name: str, *, mean: float = 0.0, scale: float = 1.0, seed: int 
     return experts[checks.one_of("expert", name, SIMULATED)]
 
 
-def simulated_expert(wrong_answers: float = 0.0, *, seed: int = 0) -> Expert:
-    """`ReturnExpert`, as a `NoisyExpert` where `wrong_answers`, the probability of a wrong answer, is positive."""
-    return NoisyExpert(ReturnExpert(), wrong_answers, seed) if wrong_answers else ReturnExpert()
-
-
 PROMPT = "Which is better? [1] first  [2] second  [t] tie  [s] cannot tell  [u] undo  [q] stop here: "
 KEYS = {"1": Answer.FIRST, "2": Answer.SECOND, "t": Answer.TIE, "s": Answer.SKIP, "u": Answer.UNDO}
 

@@ -19,7 +19,6 @@ import bayespbrl
 from bayespbrl.cli.commands import main
 from bayespbrl.cli.compiled import VARIABLE, keep_compiled
 from bayespbrl.cli.display import show_trials
-from bayespbrl.experts import simulated_expert
 from bayespbrl.studies import Trials
 
 SHORT = ["--preset", "paper", "--utility", "linear-program", "--max-steps", "20"]
@@ -135,7 +134,7 @@ def test_resuming_a_finished_run_says_so(monkeypatch, capsys, finished):
 def test_resuming_draws_the_pictures_that_a_finished_run_lacks(monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     options = {"preset": "paper", "utility": "linear-program", "iterations": 1, "max_steps": 20, "expert": "other"}
-    bayespbrl.start("gridworld", out, **options).run(simulated_expert())
+    bayespbrl.start("gridworld", out, **options).run(bayespbrl.ReturnExpert())
     before = (out / "events.jsonl").read_bytes()
     assert call(monkeypatch, "resume", out) == 0
     shown = capsys.readouterr().out
