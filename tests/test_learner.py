@@ -20,6 +20,7 @@ from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.improvement.update import NEARLY
 from bayespbrl.models import restored, stored
+from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
 
@@ -256,11 +257,15 @@ def test_a_learner_that_is_sure_asks_nothing(threshold, monkeypatch):
     assert answers == {0.0: 5, 1.1: 10}.get(threshold, answers)
 
 
+def threads():
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
 class Threads(Slope):
     """Notes how many threads the linear algebra has while an iteration is computed."""
 
     def step(self, action):
-        self.seen = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+        self.seen = threads()
         return super().step(action)
 
 
@@ -271,6 +276,16 @@ def test_an_iteration_has_one_thread_of_linear_algebra_and_gives_the_others_back
         learner.ask()
         assert env.seen == {1}
         assert threadpool_info() == before
+
+
+def test_one_thread_of_linear_algebra_is_wanted_until_the_last_leaves():
+    with threadpool_limits(2, user_api="blas"):
+        first, second = one_blas_thread(), one_blas_thread()
+        with first:
+            second.__enter__()
+        assert threads() == {1}
+        second.__exit__(None, None, None)
+        assert threads() == {2}
 
 
 def test_asking_again_changes_nothing():
