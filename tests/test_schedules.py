@@ -8,7 +8,15 @@ import pytest
 
 from bayespbrl import Learner, load, resume, start
 from bayespbrl.experts import ReturnExpert
-from bayespbrl.improvement.schedules import LEAST_BOUND, Bound, ConfidenceBound, ConstantBound, Situation, decide
+from bayespbrl.improvement.schedules import (
+    LEAST_BOUND,
+    SCHEDULES,
+    Bound,
+    ConfidenceBound,
+    ConstantBound,
+    Situation,
+    decide,
+)
 from bayespbrl.improvement.update import ProposedUpdate
 
 NUMBER = 400
@@ -194,6 +202,16 @@ def test_the_bound_follows_the_posterior_of_a_run_and_comes_from_the_same_choice
         assert 0 <= summary["schedule"]["signal"] <= 1
         assert 0 <= summary["schedule"]["agreement"] <= 1
         assert summary["schedule"]["rhat_max"] == summary["rhat_max"]
+
+
+def test_a_schedule_named_in_schedules_is_used_by_that_name(tmp_path, monkeypatch):
+    monkeypatch.setitem(SCHEDULES, "by-the-clock", three_lines)
+    start("gridworld", tmp_path / "run", schedule="by-the-clock", iterations=2, **QUICK)
+    whole = resume(tmp_path / "run").run(ReturnExpert())  # the name alone says which
+    assert [summary["schedule"]["reason"] for summary in whole.iterations] == ["by the clock"] * 2
+    monkeypatch.delitem(SCHEDULES, "by-the-clock")
+    with pytest.raises(ValueError, match=r"^schedule: expected one of .*, got 'by-the-clock'$"):
+        Learner("gridworld", schedule="by-the-clock")
 
 
 def test_a_schedule_of_the_users_own_has_to_be_given():

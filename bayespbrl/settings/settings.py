@@ -13,6 +13,7 @@ from bayespbrl.experts import SIMULATED
 from bayespbrl.features import RadialBasisOptions
 from bayespbrl.improvement.problem import PolicyUpdate
 from bayespbrl.improvement.q_function import Critic
+from bayespbrl.improvement.schedules import SCHEDULES
 from bayespbrl.models import PreferenceModel
 from bayespbrl.questions import Questions
 from bayespbrl.settings import presets
@@ -151,6 +152,7 @@ class Settings:
     def _check_together(self) -> None:
         """What one part's option asks of another part's."""
         utility, query, schedule = self.estimation.utility, self.questions.query, self.update.schedule
+        checks.one_of("schedule", schedule, (*SCHEDULES, "other"))
         if utility in WITHOUT_POSTERIOR and query not in ("highest-utility", "other"):
             raise ValueError(f"query: expected highest-utility with {utility}, no posterior, got {query!r}")
         if self.estimation.plain_draws is not None and None in (self.model.steepness, self.model.lapse_rate):
