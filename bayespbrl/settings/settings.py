@@ -15,6 +15,7 @@ from bayespbrl.improvement.problem import PolicyUpdate
 from bayespbrl.improvement.q_function import Critic
 from bayespbrl.improvement.schedules import SCHEDULES
 from bayespbrl.models import PreferenceModel
+from bayespbrl.policies.choice import POLICIES
 from bayespbrl.questions import Questions
 from bayespbrl.settings import presets
 from bayespbrl.settings.presets import Task, preset_options
@@ -22,7 +23,6 @@ from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 
 LAST_ITERATIONS = 5  # after the last answer: the policy catches up with what is known
 MOST_UNASKED = 10  # in a row; then more answers would change little
-POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Rollouts:
         if self.exploration_hold is not None:
             checks.whole("exploration_hold", self.exploration_hold)
         checks.whole("evaluation_episodes", self.evaluation_episodes)
-        checks.one_of("policy", self.policy, POLICIES)
+        checks.one_of("policy", self.policy, ("auto", *POLICIES, "other"))
         checks.positive("initial_action_scale", self.initial_action_scale)
 
 
