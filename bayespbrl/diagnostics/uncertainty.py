@@ -21,7 +21,7 @@ from bayespbrl.diagnostics.estimates import expect_posterior
 from bayespbrl.improvement.q_function import Evidence, estimate_q
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Trajectory, transitions
-from bayespbrl.utility import PosteriorUtility, UtilityEstimate
+from bayespbrl.utility import UtilityEstimate
 from bayespbrl.utility.posterior_utility import spacing
 
 # Quantiles and line widths of the intervals in the figures, which hold 50 % and 90 % of the draws.
@@ -44,9 +44,9 @@ def return_draws(
     Raises:
       ValueError: an estimate without a posterior; no trajectories; a number < 1.
     """
-    fit = expect_posterior(estimate)
+    fit, posterior = expect_posterior(estimate)
     draws = fit.trajectory_draws(trajectories, number=number)
-    chains = fit.posterior["posterior"].sizes["chain"]
+    chains = posterior["posterior"].sizes["chain"]
     return xr.Dataset(
         {"returns": (("chain", "draw", "trajectory"), draws.reshape(chains, -1, len(trajectories)))},
         {"trajectory": np.arange(len(trajectories))},
@@ -110,7 +110,8 @@ def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: 
     Raises:
       ValueError: a learner without an estimate that has a posterior; no states or no actions.
     """
-    fit, states, actions = expect_posterior(learner.estimate), np.asarray(states), np.asarray(actions)
+    states, actions = np.asarray(states), np.asarray(actions)
+    fit, posterior = expect_posterior(learner.estimate)
     if states.ndim == 0 or actions.ndim == 0 or not (len(states) and len(actions)):
         raise ValueError(f"states, actions: expected at least one row each, got {states.shape} and {actions.shape}")
     steps = transitions(learner.trajectories)
@@ -126,7 +127,7 @@ def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: 
         critic=learner.settings.critic,
     )
     rows = q(np.repeat(states, len(actions), axis=0), np.concatenate([actions] * len(states)))
-    shape = (fit.posterior["posterior"].sizes["chain"], -1, len(states), len(actions))
+    shape = (posterior["posterior"].sizes["chain"], -1, len(states), len(actions))
     labels = actions.reshape(len(actions), -1)
     return xr.Dataset(
         {"q": (("chain", "draw", "state", "action"), rows.T.reshape(shape))},
@@ -239,7 +240,7 @@ def thinned(tree: xr.DataTree, number: int) -> xr.DataTree:
     return tree.isel(draw=slice(None, None, spacing(sizes["chain"] * sizes["draw"], number)))
 
 
-def _convergence(fit: PosteriorUtility) -> dict[str, float]:
+def _convergence(fit: UtilityEstimate) -> dict[str, float]:
     return {"converged": int(fit.quality.converged), "rhat_max": float(fit.quality.rhat_max)}
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +31,11 @@ class LinearProgramUtility(WithoutDraws):
     quality: FitQuality
     scale: float = 1.0
 
+    @property
+    def number_of_features(self) -> int:
+        """D."""
+        return len(self.weights)
+
     def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
         """wᵀφ(s) of n states."""
         return linear(self.features(states), self.weights)
@@ -48,6 +54,12 @@ class KnownReward(WithoutDraws):
     """The environment's own reward in place of an estimate: a reference run trained on the hidden reward."""
 
     quality: FitQuality
+    features = None
+    number_of_features = 0
+
+    def utilities(self, states: np.ndarray) -> NoReturn:
+        """None: a ValueError, since the reward is one of steps."""
+        raise ValueError("utilities: expected a utility of states, got KnownReward")
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
         """The hidden reward of each transition."""

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from gymnasium.experimental.functional import FuncEnv
 
-from bayespbrl.diagnostics.estimates import first_preferred_probability, number_of_features, of_states
+from bayespbrl.diagnostics.estimates import first_preferred_probability, of_states
 from bayespbrl.diagnostics.predictions import fitted_model
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
@@ -225,7 +225,7 @@ def _features_failure(estimate: Any, features: StateFeatures | None, trajectory:
         width = checked_features(features, trajectory.states).shape[1]
     except Exception as error:  # a function of the user's may raise anything
         return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
-    expected = number_of_features(estimate)
+    expected = estimate.number_of_features
     return "" if width == expected else f"the one that was passed has {width} features, the run's {expected}"
 
 
