@@ -22,6 +22,7 @@ from bayespbrl.settings.presets import Task, preset_options
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 
 LAST_ITERATIONS = 5  # after the last answer: the policy catches up with what is known
+INFERRED: dict[str, Any] = {"steepness": None, "lapse_rate": None}  # unless they or all hyperparameters are given
 MOST_UNASKED = 10  # in a row; then more answers would change little
 
 
@@ -129,7 +130,7 @@ class Settings:
     environment: str = "named"
     expert: str = "return"
     wrong_answers: float = 0.0
-    model: PreferenceModel = field(default_factory=partial(PreferenceModel, steepness=None, lapse_rate=None))
+    model: PreferenceModel = field(default_factory=partial(PreferenceModel, **INFERRED))
     estimation: Estimation = field(default_factory=Estimation)
     features: Features = field(default_factory=Features)
     critic: Critic = field(default_factory=Critic)
@@ -178,7 +179,7 @@ class Settings:
         for name, value in options.items():
             parts[OPTIONS[name]][name] = value
         if parts["estimation"].get("hyperparameters", Estimation.hyperparameters) == "inferred":
-            parts["model"] = {"steepness": None, "lapse_rate": None} | parts["model"]
+            parts["model"] = INFERRED | parts["model"]
         own = parts.pop("")
         return cls(env, **own, **{name: PARTS[name](**chosen) for name, chosen in parts.items()})
 

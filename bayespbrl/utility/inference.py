@@ -11,6 +11,7 @@ from bayespbrl import checks
 from bayespbrl.features import StateFeatures
 from bayespbrl.models import Answers, PreferenceModel, linear_program, plain_chain, plain_draws, posterior_draws
 from bayespbrl.models.posterior_tree import bases_of
+from bayespbrl.trajectories import DISCOUNT
 from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.length_scales import settings, sums_under
@@ -90,7 +91,7 @@ def infer_utility(
     answerers: ArrayLike | None = None,
     features: StateFeatures | None = None,
     method: str = "posterior-mean",
-    discount: float = 0.98,
+    discount: float = DISCOUNT,
     prior_scale: float = PreferenceModel.prior_scale,
     steepness: float | None = None,
     lapse_rate: float | None = None,
