@@ -167,6 +167,19 @@ def test_statistics_may_be_flags_texts_and_lists():
     assert decide(lambda situation: Bound(0.2, "mine", 0.5, statistics), situation(proposed())).statistics == statistics
 
 
+@pytest.mark.parametrize("needs_draws", [True, False])
+def test_a_schedule_that_needs_no_draws_says_so_and_gets_none(needs_draws):
+    seen = []
+
+    def own(situation):
+        seen.append(situation.update.q_draws is not None and situation.update.q_halves is not None)
+        return 0.2
+
+    own.needs_draws = needs_draws
+    Learner("gridworld", schedule=own, iterations=1, answers=2, max_steps=20, evaluation_episodes=2).run(ReturnExpert())
+    assert seen == [needs_draws]
+
+
 @pytest.mark.parametrize("largest", [0.0, -1.0, float("nan"), float("inf")])
 def test_bad_options_are_refused(largest):
     with pytest.raises(ValueError, match="largest: expected"):

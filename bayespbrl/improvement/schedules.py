@@ -10,7 +10,7 @@ with the `Situation` and returns the bound in nats, or a `Bound` with its reason
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -58,18 +58,13 @@ class Bound:
     statistics: Mapping[str, float] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """Reason, signal and statistics as plain data; `recalled` reads them."""
+        """Reason, signal and statistics as plain data."""
         signal = {} if self.signal is None else {"signal": self.signal}
         return {"reason": self.reason, **signal, **self.statistics}
 
-    @classmethod
-    def recalled(cls, kl_bound: float, summary: Mapping[str, Any]) -> "Bound":
-        """The bound that `summary` describes."""
-        signal = summary.get("signal")
-        figures = {name: value for name, value in summary.items() if name not in ("reason", "signal")}
-        return cls(kl_bound, summary.get("reason", ""), signal, figures)
 
-
+# One that looks at neither the draws nor the halves of an update may have an attribute `needs_draws` that is False:
+# they are not computed then.
 Schedule = Callable[[Situation], "Bound | float"]
 
 
@@ -78,6 +73,7 @@ class ConstantBound:
     """The same bound at every iteration, the paper's schedule: the run's own where `kl_bound` is None."""
 
     kl_bound: float | None = None
+    needs_draws: ClassVar[bool] = False
 
     def __call__(self, situation: Situation) -> Bound:
         return Bound(situation.usual_bound if self.kl_bound is None else self.kl_bound, "constant")
