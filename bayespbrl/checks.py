@@ -14,6 +14,20 @@ def whole(name: str, value: Any, least: int = 1) -> int:
     return int(value)
 
 
+def boolean(name: str, value: Any) -> bool:
+    """`value`, where it is true or false."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{name}: expected true or false, got {value!r}")
+    return value
+
+
+def number(name: str, value: Any) -> float:
+    """`value` as a float, where it is finite."""
+    if not _is_number(value):
+        raise ValueError(f"{name}: expected a finite number, got {value!r}")
+    return float(value)
+
+
 def positive(name: str, value: Any) -> float:
     """`value` as a float, where it is finite and > 0."""
     if not (_is_number(value) and value > 0):

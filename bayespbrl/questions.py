@@ -62,8 +62,7 @@ class Questions:
         if self.clip_steps is not None:
             checks.whole("clip_steps", self.clip_steps)
         for name in ("same_start", "worthwhile"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
+            checks.boolean(name, getattr(self, name))
         if self.same_start and self.clip_steps is not None:
             raise ValueError("same_start: expected false with clip_steps, parts that begin anywhere, got true")
 

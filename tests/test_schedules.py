@@ -138,7 +138,7 @@ def test_a_schedule_that_decides_nonsense_is_named(value):
     def careless(situation):
         return value
 
-    with pytest.raises(ValueError, match="schedule careless: expected a positive finite KL bound, got"):
+    with pytest.raises(ValueError, match="schedule careless, KL bound: expected a positive finite number, got"):
         decide(careless, situation(proposed()))
 
 

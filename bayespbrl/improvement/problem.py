@@ -62,8 +62,7 @@ class PolicyUpdate:
             if getattr(self, name) is not None:
                 checks.whole(name, getattr(self, name))
         checks.whole("update_states", self.update_states)
-        if not isinstance(self.checked, bool):
-            raise ValueError(f"checked: expected true or false, got {self.checked!r}")
+        checks.boolean("checked", self.checked)
         checks.whole("check_episodes", self.check_episodes, 2)
         checks.whole("restart_iterations", self.restart_iterations, 0)
 

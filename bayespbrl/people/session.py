@@ -309,6 +309,6 @@ def answer_of(message: Any) -> tuple[int, str, float | None]:
     turn, answer, seconds = (message.get(name) for name in ("turn", "answer", "seconds"))
     if type(turn) is not int or not isinstance(answer, str):
         raise ValueError(f"answer: expected the number of a turn and an answer, got {turn!r} and {answer!r}"[:200])
-    if seconds is not None and (isinstance(seconds, bool) or not isinstance(seconds, int | float)):
-        raise ValueError("seconds: expected a number")
+    if seconds is not None:
+        checks.number("seconds", seconds)
     return turn, answer, seconds

@@ -55,8 +55,7 @@ class Features:
         checks.positive("bandwidth_factor", self.bandwidth_factor)
         checks.positive("utility_bandwidth_factor", self.utility_bandwidth_factor)
         for name in ("normalised_utility", "constant_utility"):
-            if not isinstance(value := getattr(self, name), bool):
-                raise ValueError(f"{name}: expected true or false, got {value!r}")
+            checks.boolean(name, getattr(self, name))
 
     @property
     def of_critic(self) -> RadialBasisOptions:
