@@ -55,7 +55,7 @@ def drawn():
 def quick_pictures(request, monkeypatch):
     """Most tests read only the text."""
     if "drawn" not in request.fixturenames:
-        monkeypatch.setattr(report_document, "_png", no_picture)
+        monkeypatch.setattr(report_document, "_few_colours", no_picture)
 
 
 class Reader(HTMLParser):
@@ -103,7 +103,7 @@ def contents(gridworld_run):
 def page(gridworld_run):
     """The report of `gridworld_run`, without pictures."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report_document, "_png", no_picture)
+        patch.setattr(report_document, "_few_colours", no_picture)
         return read(write_report(gridworld_run))
 
 

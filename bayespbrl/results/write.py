@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from bayespbrl.figures import png
 from bayespbrl.results.figures import curves_figure, profiles_figure
 from bayespbrl.results.predictions import write_predictions
 from bayespbrl.results.study_data import StudyData, read_study
@@ -88,7 +89,7 @@ def write_results(directory: Path | str, out: Path | str | None = None) -> list[
     for name, figure in (("curves", curves_figure(data)), ("profiles", profiles_figure(data))):
         if figure is not None:
             written.append(out / f"{name}.png")
-            figure.savefig(written[-1], dpi=110)
+            write_file(written[-1], png(figure))
             sections.append(f"![{name}]({name}.png)")
     write_file(out / "results.md", "\n\n".join(sections) + "\n")
     return [out / "results.md", *written]
