@@ -15,7 +15,6 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 from scipy.stats import rankdata
 
-from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.estimates import expect_posterior
 from bayespbrl.improvement.q_function import Evidence, estimate_q
@@ -169,7 +168,7 @@ def plot_returns(returns: xr.Dataset, axes: Axes) -> Axes:
     values = _pooled(returns["returns"])
     values = values - values.mean(axis=1, keepdims=True)
     order = np.argsort(np.median(values, axis=0), kind="stable")
-    _intervals(values[:, order], np.arange(len(order)), axes, horizontal=True)
+    _intervals(values[:, order], np.arange(len(order)), axes)
     axes.set_yticks(np.arange(len(order)), [str(label) for label in returns["trajectory"].values[order]])
     axes.axvline(0.0, color="0.5", linestyle="--", linewidth=1)
     axes.set_title(_titled("Returns", returns))
@@ -190,30 +189,6 @@ def plot_ranking(ranking: xr.Dataset, axes: Axes) -> Axes:
     )
     title = _titled("Ranking", ranking)
     return finished(axes, xlabel="rank", ylabel="trajectory (probability to be best)", title=title)
-
-
-def plot_q(q: xr.Dataset, axes: Axes, *, state: int = 0) -> Axes:
-    """Intervals of Q(s, a) relative to the mean over actions, which does not matter to the choice.
-
-    Args:
-      q: what `q_draws` returned.
-      axes: to draw on.
-      state: the number of the state.
-
-    Raises:
-      ValueError: an unknown state.
-    """
-    state = checks.index("state", state, q.sizes["state"])
-    values = _pooled(q["q"].isel(state=state))
-    values = values - values.mean(axis=1, keepdims=True)
-    actions = q["action"].values
-    _intervals(values, actions, axes, horizontal=False)
-    if not np.issubdtype(actions.dtype, np.floating):
-        axes.set_xticks(actions)
-    axes.axhline(0.0, color="0.5", linestyle="--", linewidth=1)
-    label = "Q relative to the mean (units of the utility)"
-    axes.set(xlabel="action", ylabel=label, title=_titled(f"Q in state {state}", q))
-    return axes
 
 
 def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
@@ -254,10 +229,7 @@ def _titled(title: str, result: xr.Dataset) -> str:
     return title if result.attrs.get("converged", 1) else f"{title} (the fit has not converged)"
 
 
-def _intervals(values: np.ndarray, places: np.ndarray, axes: Axes, *, horizontal: bool) -> None:
-    lines = axes.hlines if horizontal else axes.vlines
+def _intervals(values: np.ndarray, places: np.ndarray, axes: Axes) -> None:
     for low, high, width in INTERVALS:
-        lines(places, *np.quantile(values, [low, high], axis=0), linewidth=width, color="tab:blue")
-    medians = np.median(values, axis=0)
-    across = (medians, places) if horizontal else (places, medians)
-    axes.plot(*across, "o", color="white", markeredgecolor="tab:blue", markersize=5)
+        axes.hlines(places, *np.quantile(values, [low, high], axis=0), linewidth=width, color="tab:blue")
+    axes.plot(np.median(values, axis=0), places, "o", color="white", markeredgecolor="tab:blue", markersize=5)
