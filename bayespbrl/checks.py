@@ -1,7 +1,7 @@
 """Checks of arguments, one for each kind: a `ValueError` says which argument it is, what was expected and what came."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,12 @@ def number(name: str, value: Any) -> float:
     if not _is_number(value):
         raise ValueError(f"{name}: expected a finite number, got {value!r}")
     return float(value)
+
+
+def optional(check: Callable[..., Any], name: str, value: Any, **limits: Any) -> None:
+    """`check` of `value`, unless it is None."""
+    if value is not None:
+        check(name, value, **limits)
 
 
 def positive(name: str, value: Any) -> float:

@@ -1,12 +1,4 @@
-"""The environments of the paper, registered with gymnasium on import.
-
-| short name | gymnasium id             | dynamics            |
-|------------|--------------------------|---------------------|
-| gridworld  | `bayespbrl/Gridworld-v0` | `GridworldDynamics` |
-| bicycle    | `bayespbrl/Bicycle-v0`   | `BicycleDynamics`   |
-| swing-up   | `bayespbrl/SwingUp-v0`   | `SwingUpDynamics`   |
-| acrobot    | `bayespbrl/Acrobot-v0`   | `AcrobotDynamics`   |
-"""
+"""The environments of the paper, registered with gymnasium on import."""
 
 from importlib import import_module
 

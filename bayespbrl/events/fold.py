@@ -138,8 +138,7 @@ def _asked(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     compared = state.compared
     both = (compared[shown[0]], compared[shown[1]])
     rivals, answerer = event.get("rivals"), event.get("answerer")
-    if answerer is not None:
-        checks.short_name("answerer", answerer)
+    checks.optional(checks.short_name, "answerer", answerer)
     if rivals is None and event["newcomer"] in shown and repeats is None:
         incumbent = shown[shown[0] == event["newcomer"]]
         newest = incumbent in state.preferences.undominated[-1:]
@@ -155,10 +154,8 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         waiting = [waiting.number for waiting in state.open]
         raise ValueError(f"answered: expected an answer to an open question of {waiting}, got one to {event['query']}")
     answer, answerer, seconds = parse_answer(event["answer"]), event.get("answerer"), event.get("seconds")
-    if answerer is not None:
-        checks.short_name("answerer", answerer)
-    if seconds is not None:
-        checks.non_negative("seconds", seconds)
+    checks.optional(checks.short_name, "answerer", answerer)
+    checks.optional(checks.non_negative, "seconds", seconds)
     left, again = state.candidates, query.repeats is not None
     if not again:
         left = tuple(number for number in left if number != query.newcomer)

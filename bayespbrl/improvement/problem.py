@@ -59,8 +59,7 @@ class PolicyUpdate:
         checks.positive("kl_bound", self.kl_bound)
         checks.whole("updates_per_iteration", self.updates_per_iteration)
         for name in ("recent_iterations", "critic_iterations"):
-            if getattr(self, name) is not None:
-                checks.whole(name, getattr(self, name))
+            checks.optional(checks.whole, name, getattr(self, name))
         checks.whole("update_states", self.update_states)
         checks.boolean("checked", self.checked)
         checks.whole("check_episodes", self.check_episodes, 2)

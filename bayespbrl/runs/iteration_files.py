@@ -128,24 +128,16 @@ def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
 
 def _estimate_groups(estimate: UtilityEstimate) -> dict[str, xr.DataTree]:
     """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
-    own = estimate.features is not None and not _can_be_stored(estimate.features)
-    groups = {"utility": to_tree(estimate, without=("posterior", "features") if own else ("posterior",))}
-    if own:
-        groups["utility"].attrs["features"] = "other"  # the user's function, which has to be passed again
+    try:
+        groups = {"utility": to_tree(estimate, without=("posterior",))}
+    except ValueError:  # φ is a function of the user's, which has to be passed again
+        groups = {"utility": to_tree(estimate, without=("posterior", "features"))}
+        groups["utility"].attrs["features"] = "other"
     if estimate.posterior is not None:
         small = stored(estimate.posterior)
         groups |= {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
         groups["fit"] = xr.DataTree(small.to_dataset())
     return groups
-
-
-def _can_be_stored(features: StateFeatures) -> bool:
-    """Whether φ is a dataclass, as ours are, rather than a function of the user's."""
-    try:
-        to_tree(features)
-    except ValueError:
-        return False
-    return True
 
 
 def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Sequence[type]) -> UtilityEstimate:

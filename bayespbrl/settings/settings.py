@@ -98,10 +98,8 @@ class Rollouts:
 
     def __post_init__(self) -> None:
         checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
-        if self.max_steps is not None:
-            checks.whole("max_steps", self.max_steps)
-        if self.exploration_hold is not None:
-            checks.whole("exploration_hold", self.exploration_hold)
+        checks.optional(checks.whole, "max_steps", self.max_steps)
+        checks.optional(checks.whole, "exploration_hold", self.exploration_hold)
         checks.whole("evaluation_episodes", self.evaluation_episodes)
         checks.one_of("policy", self.policy, ("auto", *POLICIES, "other"))
         checks.positive("initial_action_scale", self.initial_action_scale)
@@ -189,13 +187,11 @@ class Settings:
     @property
     def most_iterations(self) -> int:
         """The limit that holds: `iterations`, else three for every two answers, and the last ones."""
-        budget = self.questions.answers
-        if self.iterations is None:
-            assert budget is not None
-            if self._restarted:
-                return max(3 * budget // 2, LAST_ITERATIONS) + self._restarted
-            return 3 * budget // 2 + LAST_ITERATIONS
-        return self.iterations
+        if self.iterations is not None:
+            return self.iterations
+        assert self.questions.answers is not None
+        most = 3 * self.questions.answers // 2
+        return max(most, LAST_ITERATIONS) + self._restarted if self._restarted else most + LAST_ITERATIONS
 
     @property
     def _restarted(self) -> int:

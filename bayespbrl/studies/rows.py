@@ -106,8 +106,7 @@ def row_of(
     """
     if directory.exists() and not directory.is_dir():
         raise ValueError(f"{directory}: expected a directory for the trials, got a file")
-    if preference_within is not None:
-        checks.whole("preference_within", preference_within)
+    checks.optional(checks.whole, "preference_within", preference_within)
     environment = open_environment(env)
     identity = environment_name(environment)
     first = settings_for(env, task=task_of(environment, options.get("max_steps")), **options, seed=seed)

@@ -93,26 +93,26 @@ class UtilityEstimate(Protocol):
         ...
 
 
-def _needs_posterior(asked: str) -> Callable[..., Any]:
-    """The method of that name without a posterior: a ValueError."""
+def refused(asked: str, needed: str = "an estimate with a posterior") -> Callable[..., Any]:
+    """The method of that name of an estimate without what it needs: a ValueError."""
 
-    def refused(self: object, *arguments: Any, **options: Any) -> NoReturn:
-        raise ValueError(f"{asked}: expected an estimate with a posterior, got {type(self).__name__} without")
+    def method(self: object, *arguments: Any, **options: Any) -> NoReturn:
+        raise ValueError(f"{asked}: expected {needed}, got {type(self).__name__}")
 
-    return refused
+    return method
 
 
 class WithoutDraws:
     """The part of the protocol that a point estimate lacks."""
 
     posterior = None
-    likelihood = _needs_posterior("likelihood")
-    tie_thresholds = _needs_posterior("tie_thresholds")
-    utilities_and_draws = _needs_posterior("utilities_and_draws")
-    mean_utilities = _needs_posterior("mean_utilities")
-    prior_deviations = _needs_posterior("prior_deviations")
-    trajectory_draws = _needs_posterior("trajectory_draws")
-    differences = _needs_posterior("differences")
+    likelihood = refused("likelihood")
+    tie_thresholds = refused("tie_thresholds")
+    utilities_and_draws = refused("utilities_and_draws")
+    mean_utilities = refused("mean_utilities")
+    prior_deviations = refused("prior_deviations")
+    trajectory_draws = refused("trajectory_draws")
+    differences = refused("differences")
 
     def thinned(self, number: int) -> Self:
         """Itself: there are no draws."""

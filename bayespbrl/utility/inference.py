@@ -46,8 +46,7 @@ class Estimation:
     def __post_init__(self) -> None:
         checks.one_of("utility", self.utility, METHODS)
         checks.one_of("hyperparameters", self.hyperparameters, ("inferred", "given"))
-        if self.trajectory_discount is not None:
-            checks.share("trajectory_discount", self.trajectory_discount)
+        checks.optional(checks.share, "trajectory_discount", self.trajectory_discount)
         if self.plain_draws is not None:
             checks.whole("plain_draws", self.plain_draws, plain_chain.LEAST)
             if self.hyperparameters != "given":

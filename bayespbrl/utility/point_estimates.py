@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
 
 from bayespbrl.features import StateFeatures, linear
 from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
-from bayespbrl.utility.estimate import WithoutDraws
+from bayespbrl.utility.estimate import WithoutDraws, refused
 from bayespbrl.utility.quality import FitQuality
 
 
@@ -56,10 +55,7 @@ class KnownReward(WithoutDraws):
     quality: FitQuality
     features = None
     number_of_features = 0
-
-    def utilities(self, states: np.ndarray) -> NoReturn:
-        """None: a ValueError, since the reward is one of steps."""
-        raise ValueError("utilities: expected a utility of states, got KnownReward")
+    utilities = refused("utilities", "a utility of states")
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
         """The hidden reward of each transition."""
