@@ -1,5 +1,6 @@
 """The netCDF file of one iteration: its trajectories, the policy and what was tried of it, the utility estimate."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from bayespbrl.models import restored, stored
 from bayespbrl.runs.files import NETCDF, write_netcdf
 from bayespbrl.runs.stored_classes import from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEstimate
+from bayespbrl.utility import UtilityEstimate
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 MOST_BYTES_A_BYTE = 16  # arrays of a file in bytes, by its size
@@ -149,11 +150,8 @@ def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Seq
         if features is None:
             raise ValueError("a run with features of the user's own: pass them again as features=")
         given["features"] = features
-    if "class" in utility.attrs:
-        return from_tree(utility, known=known, given=given)
-    # Earlier versions named no class here: the posterior's groups say which of two it is.
-    children = {name: from_tree(child, known=known) for name, child in utility.children.items()}
-    arrays = {str(name): variable.values for name, variable in utility.data_vars.items()}
-    numbers = {name: float(utility.attrs[name]) for name in ("discount", "scale") if name in utility.attrs}
-    kind: Any = PosteriorUtility if "posterior" in given else LinearProgramUtility
-    return kind(**arrays, **numbers, **children, **given)
+    if "class" not in utility.attrs:  # by an earlier version: the posterior's groups say which of two it is
+        numbers = {name: float(utility.attrs[name]) for name in ("discount", "scale") if name in utility.attrs}
+        kind = "posterior" if "posterior" in given else "linear-program"
+        utility.attrs |= {"class": kind, "fields": json.dumps(numbers)}
+    return from_tree(utility, known=known, given=given)

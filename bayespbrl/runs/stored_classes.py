@@ -45,20 +45,18 @@ def to_tree(instance: Any, *, without: Collection[str] = ()) -> xr.DataTree:
     if not dataclasses.is_dataclass(instance) or isinstance(instance, type):
         raise ValueError(f"stored class: expected an instance of a dataclass, got {type(instance).__name__}")
     arrays, plain, children = {}, {}, {}
-    for field in dataclasses.fields(instance):
-        if field.name in without:
-            continue
-        value = getattr(instance, field.name)
+    for name in [field.name for field in dataclasses.fields(instance) if field.name not in without]:
+        value = getattr(instance, name)
         if isinstance(value, np.ndarray | jax.Array):
             array = np.asarray(value)
-            arrays[field.name] = ([f"{field.name}_{axis}" for axis in range(array.ndim)], array)
+            arrays[name] = ([f"{name}_{axis}" for axis in range(array.ndim)], array)
         elif dataclasses.is_dataclass(value):
-            children[field.name] = to_tree(value)
+            children[name] = to_tree(value)
         elif value is None or isinstance(value, bool | int | float | str | tuple | np.generic):
-            plain[field.name] = value.item() if isinstance(value, np.generic) else value
+            plain[name] = value.item() if isinstance(value, np.generic) else value
         else:
             raise ValueError(
-                f"stored class: expected an array, number or text in {type(instance).__name__}.{field.name}, "
+                f"stored class: expected an array, number or text in {type(instance).__name__}.{name}, "
                 f"got {type(value).__name__}"
             )
     attributes = {"class": stored_name(type(instance)), "fields": json.dumps(plain)}
