@@ -24,11 +24,6 @@ def expect_estimate(estimate: UtilityEstimate | None) -> UtilityEstimate:
     return estimate
 
 
-def of_states(estimate: UtilityEstimate | None) -> bool:
-    """Whether it is a utility of states, as every estimate is but the known reward."""
-    return estimate is not None and estimate.features is not None
-
-
 def first_preferred_probability(
     estimate: UtilityEstimate, first: Trajectory, second: Trajectory, *, answerer: str | None = None
 ) -> float:

@@ -109,8 +109,7 @@ def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: 
     Raises:
       ValueError: a learner without an estimate that has a posterior; no states or no actions.
     """
-    states, actions = np.asarray(states), np.asarray(actions)
-    fit, posterior = expect_posterior(learner.estimate)
+    (fit, posterior), states, actions = expect_posterior(learner.estimate), np.asarray(states), np.asarray(actions)
     if states.ndim == 0 or actions.ndim == 0 or not (len(states) and len(actions)):
         raise ValueError(f"states, actions: expected at least one row each, got {states.shape} and {actions.shape}")
     steps = transitions(learner.trajectories)

@@ -17,10 +17,10 @@ from bayespbrl.runs.simulated import SIMULATED, expert_of
 from bayespbrl.settings import Settings, settings_for
 from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
+    BALANCING_FILE,
+    FIRST_POLICY_FILE,
     collect,
     collect_first_policies,
-    has_balancing,
-    has_first_policy,
     measure_balancing,
     measure_first_policy,
 )
@@ -74,14 +74,12 @@ class Row:
         kept = RunDirectory.open(path)
         if kept.settings != replace(self.settings, seed=seed):
             raise ValueError(f"{path}: expected a trial with these settings, got others: {kept.settings}")
-        if self.untrained:
-            return True if has_first_policy(path) else None
-        if self.baseline is not None:
-            return True if (path / BASELINE_FILE).exists() else None
+        if self.untrained or self.baseline is not None:
+            return True if (path / (FIRST_POLICY_FILE if self.untrained else BASELINE_FILE)).exists() else None
         done = read_summary(path)["iterations"] if (path / "summary.json").exists() else []
         if done and self.redraws(len(done), done[-1]["pairs"]):
             return False
-        measured = self.balancing_steps is None or has_balancing(path)
+        measured = self.balancing_steps is None or (path / BALANCING_FILE).exists()
         return True if measured and kept.finished() else None
 
     def redraws(self, iterations: int, pairs: int) -> bool:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from bayespbrl.diagnostics.estimates import of_states
 from bayespbrl.diagnostics.report import figures
 from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.document import Block, Body, Picture, drawn
@@ -35,7 +34,7 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
     text = [] if contents.posterior is not None else [contents.posterior_missing]
     if contents.posterior is not None:
         text.append(_what_else(estimate.hyperparameters() or {}, len(contents.posterior["utility_weights_mean"])))
-    if of_states(estimate):
+    if estimate.features is not None:
         table = utility_table(contents)
         blocks += _maps(table)
         text += _remaining_uncertainty(table)
