@@ -1,7 +1,7 @@
 """Checks of arguments, one for each kind: a `ValueError` says which argument it is, what was expected and what came."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,26 @@ def whole(name: str, value: Any, least: int = 1) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}: expected a whole number >= {least}, got {value!r}")
     return int(value)
+
+
+def boolean(name: str, value: Any) -> bool:
+    """`value`, where it is true or false."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{name}: expected true or false, got {value!r}")
+    return value
+
+
+def number(name: str, value: Any) -> float:
+    """`value` as a float, where it is finite."""
+    if not _is_number(value):
+        raise ValueError(f"{name}: expected a finite number, got {value!r}")
+    return float(value)
+
+
+def optional(check: Callable[..., Any], name: str, value: Any, **limits: Any) -> None:
+    """`check` of `value`, unless it is None."""
+    if value is not None:
+        check(name, value, **limits)
 
 
 def positive(name: str, value: Any) -> float:

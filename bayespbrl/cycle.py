@@ -210,13 +210,14 @@ class Cycle:
         value = float(evaluated.total.mean())
         clock.append(time.perf_counter())
         seconds = dict(zip(("utility", "improvement", "evaluation"), np.diff(clock).tolist(), strict=True))
+        result = None if check is None else asdict(check)
         summary = {
             "iteration": newest,
             "answers": state.preferences.answers,
-            "value": value if kept == newest else float(state.summaries[kept - 1]["value_newest"]),
+            "value": value if kept == newest else state.values[kept - 1],
             "value_newest": value,
             "kept": kept,
-            **({} if check is None else {"check": asdict(check)}),
+            **({} if result is None else {"check": result}),
             **({} if state.restart is None else {"restarted": state.started}),
             "terminated": float(evaluated.terminated.mean()),  # a share of the episodes
             **utility.quality.summary(),
@@ -225,8 +226,9 @@ class Cycle:
             "schedule": bound.summary(),
             "hyperparameters": utility.hyperparameters(),
         }
+        event = {"check": result, "kept": kept, "bound": asdict(bound), "value": value, "summary": summary}
         return _entry(
-            {"event": "improved", "iteration": newest, "summary": summary},
+            {"event": "improved", "iteration": newest, **event},
             trajectories=state.trajectories[-options.trajectories_per_iteration :],
             tried=tried,
             policy=improved.policy,
@@ -310,8 +312,8 @@ class Cycle:
         steps = transitions(taken)
         rng, key = self._rng(FEATURES, 2 * iteration + 1), self._key(IMPROVE, iteration)
         state_action_features = self.feature_source.of_steps(steps, settings.features.of_critic, rng=rng)
-        constant = isinstance(self.schedule, schedules.ConstantBound)  # looks at no draws
-        utilities, draws = step_utilities(utility, steps, draws=0 if constant else SCHEDULE_DRAWS)
+        needs_draws = getattr(self.schedule, "needs_draws", True)
+        utilities, draws = step_utilities(utility, steps, draws=SCHEDULE_DRAWS if needs_draws else 0)
         problem = UpdateProblem(
             steps,
             utilities,
@@ -320,7 +322,7 @@ class Cycle:
             state_action_features,
             self.feature_source.of_states(state.trajectories, settings.features.of_critic, rng=rng),
             self.environment.action_space,
-            None if constant else quarters(taken),
+            quarters(taken) if needs_draws else None,
         )
         stepped_back = check is not None and check.stepped_back
         policy = state.best_policy if stepped_back else state.policy

@@ -57,13 +57,10 @@ class Questions:
         checks.whole("first_queries", self.first_queries)
         checks.whole("unasked_iterations", self.unasked_iterations, 0)
         checks.share("repeats", self.repeats, below_one=True)
-        if self.answers is not None:
-            checks.whole("answers", self.answers)
-        if self.clip_steps is not None:
-            checks.whole("clip_steps", self.clip_steps)
+        checks.optional(checks.whole, "answers", self.answers)
+        checks.optional(checks.whole, "clip_steps", self.clip_steps)
         for name in ("same_start", "worthwhile"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
+            checks.boolean(name, getattr(self, name))
         if self.same_start and self.clip_steps is not None:
             raise ValueError("same_start: expected false with clip_steps, parts that begin anywhere, got true")
 

@@ -79,7 +79,7 @@ def rollout(
       ValueError: bad arguments; no time limit known; an environment that raises or returns NaN, named with the step.
     """
     env = open_environment(environment)
-    steps = _checked(env, policy, key, episodes, max_steps)
+    steps = _checked_step_limit(env, policy, key, episodes, max_steps)
     whole("hold", hold)
     if starts is not None and len(starts) != episodes:
         raise ValueError(f"starts: expected {episodes}, one for each episode, got {len(starts)}")
@@ -108,7 +108,7 @@ def returns(
       ValueError: as `rollout`.
     """
     env = open_environment(environment)
-    limit = _checked(env, policy, key, episodes, max_steps)
+    limit = _checked_step_limit(env, policy, key, episodes, max_steps)
     dynamics = _pure_dynamics(env, policy)
     if dynamics is None:
         run = _by_interface(env, policy, key, limit, max_steps is not None, episodes)
@@ -144,7 +144,7 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
     raise ValueError(f"environment {environment_name(env)} states no time limit: expected max_steps, got None")
 
 
-def _checked(env: gymnasium.Env, policy: Any, key: Any, episodes: Any, max_steps: int | None) -> int:
+def _checked_step_limit(env: gymnasium.Env, policy: Any, key: Any, episodes: Any, max_steps: int | None) -> int:
     if not callable(getattr(policy, "sample", None)):
         raise ValueError(f"policy: expected an object with sample(key, observation), got {type(policy).__name__}")
     if not isinstance(key, jax.Array):

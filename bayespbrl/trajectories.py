@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, Shaped
 
 from bayespbrl.checks import finite
 
+DISCOUNT = 0.98  # γ of Q, and of ψ(τ) where no learner says otherwise; the paper's
+
 
 @dataclass(frozen=True, repr=False)
 class Trajectory:

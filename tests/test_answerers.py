@@ -300,7 +300,7 @@ def answered_by_two(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_the_report_of_a_run_of_people_says_what_to_do_about_each(answered_by_two, monkeypatch):
-    monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")  # the text alone is read
+    monkeypatch.setattr(report_document, "_few_colours", lambda *a, **o: b"\x89PNG")  # the text alone is read
     text = write_report(answered_by_two, format="md").read_text()
     head, section = text[: text.index("## Learning curve")], text[text.index("## People") :]
     section = section[: section.index("\n## ")]
@@ -315,14 +315,14 @@ def test_the_report_of_a_run_of_people_says_what_to_do_about_each(answered_by_tw
 
 
 def test_a_run_of_the_simulated_expert_has_no_section_on_people(tmp_path, monkeypatch):
-    monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")
+    monkeypatch.setattr(report_document, "_few_colours", lambda *a, **o: b"\x89PNG")
     start("gridworld", tmp_path / "run", **OPTIONS).run(ReturnExpert())
     assert "## People" not in write_report(tmp_path / "run", format="md").read_text()
 
 
 @pytest.mark.slow
 def test_a_lapse_rate_that_was_set_has_no_interval_in_the_report(tmp_path, monkeypatch):
-    monkeypatch.setattr(report_document, "_png", lambda *a, **o: b"\x89PNG")
+    monkeypatch.setattr(report_document, "_few_colours", lambda *a, **o: b"\x89PNG")
     run = start("gridworld", tmp_path / "run", **(OPTIONS | {"utility": "posterior-mean", "iterations": 1}))
     run.run(ReturnExpert(), answerer="Ada")
     text = write_report(tmp_path / "run", format="md").read_text()

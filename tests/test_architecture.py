@@ -19,7 +19,7 @@ MODULES = {
 # The floors of the house from the ground up, and the rooms on each: modules, or packages with all in them that no other
 # floor names. A module imports from its own floor and from those that its floor names.
 ROOMS = {
-    "numerics": ["kernels", "checks"],
+    "numerics": ["kernels", "checks", "figures"],
     "environments": ["envs"],
     "models": ["models"],
     "policies": ["policies"],

@@ -69,6 +69,17 @@ def test_two_iterations_by_hand():
     assert (state.collected, state.query, state.candidates, state.wanted) == (False, None, (), 0)
 
 
+def test_the_learner_reads_what_an_update_decided_and_never_its_summary():
+    bound = {"kl_bound": 0.4, "reason": "mine", "signal": 0.5, "statistics": {"gain": 1.0}}
+    check = {"best": 1, "trust": 0.5, "stepped_back": True, "gain": -1.0, "standard_error": 0.1}
+    fields = {"check": check, "kept": 1, "bound": bound, "value": 7.0}
+    entries = (*HISTORY[:-1], Entry({**HISTORY[-1].event, **fields}, HISTORY[-1].parts))
+    state = replay(START, entries)
+    assert (state.bound, state.kept, state.best, state.trust) == (Bound(**bound), 1, 1, 0.5)
+    assert state.values == (0.5, 7.0)  # the first by a log of an earlier version
+    assert state.summaries == (summary(1), summary(2))
+
+
 def test_the_first_candidate_of_a_run_is_what_the_others_are_compared_with():
     state = replay(START, HISTORY[:1])
     assert state.preferences.undominated == (0,)

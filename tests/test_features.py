@@ -109,7 +109,7 @@ def test_a_constant_feature_has_the_variance_of_the_others_where_lengths_differ(
     sums = trajectory_features(walks, features, discount=1.0)
     utility = infer_utility(sums, [(3, 2), (2, 1), (1, 0)], features=features, discount=1.0)
     longer, shorter = walk(80, False), walk(10, True)
-    assert np.mean(utility.margin_draws(longer, shorter) > 0) > 0.95
+    assert np.mean(utility.trajectory_draws([longer, shorter]) @ [1, -1] > 0) > 0.95
 
 
 def test_the_traceable_row_equals_the_matrix():

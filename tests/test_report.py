@@ -55,7 +55,7 @@ def drawn():
 def quick_pictures(request, monkeypatch):
     """Most tests read only the text."""
     if "drawn" not in request.fixturenames:
-        monkeypatch.setattr(report_document, "_png", no_picture)
+        monkeypatch.setattr(report_document, "_few_colours", no_picture)
 
 
 class Reader(HTMLParser):
@@ -103,7 +103,7 @@ def contents(gridworld_run):
 def page(gridworld_run):
     """The report of `gridworld_run`, without pictures."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report_document, "_png", no_picture)
+        patch.setattr(report_document, "_few_colours", no_picture)
         return read(write_report(gridworld_run))
 
 
@@ -222,14 +222,14 @@ def test_the_answers_have_the_probabilities_of_the_posterior_over_all_length_sca
         numbers = (answer.first, answer.second)[:: 1 if str(answer.answer) == "first" else -1]
         both = [run.trajectories[number] for number in numbers]
         for name, estimate, rounding in (("before", before, 0.02), ("probability", run.estimate, 1e-4)):
-            margins = estimate.margin_draws(*both)
+            margins = estimate.trajectory_draws(both) @ [1, -1]
             p = np.exp(log_prob(estimate.likelihood(), margins[:, None])).mean()
             assert float(table[name][k]) == pytest.approx(float(p), abs=rounding)
         assert float(table["margin"][k]) == pytest.approx(margins.mean(), rel=1e-6)
         assert float(table["margin_sd"][k]) == pytest.approx(margins.std(), rel=1e-6)
         numbers = before.posterior["posterior"]["setting"].values.ravel()
         likeliest = numbers == np.bincount(numbers).argmax()
-        margins = before.margin_draws(*both)
+        margins = before.trajectory_draws(both) @ [1, -1]
         of_one_setting.append(float(np.mean(margins[likeliest] > 0)))
     assert np.abs(table["before"].values[later] - of_one_setting).max() > 0.03  # else this could not distinguish them
 

@@ -103,6 +103,7 @@ def test_the_files_of_the_iterations_are_netcdf_and_nothing_is_pickled(finished)
             states = tree["trajectories"]["states"]
             assert (states.dims, states.shape) == (("trajectory", "time"), (10, 21))
             assert tree["policy"]["table"].dtype == np.float64
+            assert tree["utility"].attrs["class"] == "linear-program"
     for path, content in contents(finished).items():
         start = content[:4]
         assert start[1:] == b"HDF" if path.endswith(".nc") else start[:1] == b"{"

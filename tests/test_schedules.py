@@ -8,7 +8,15 @@ import pytest
 
 from bayespbrl import Learner, load, resume, start
 from bayespbrl.experts import ReturnExpert
-from bayespbrl.improvement.schedules import LEAST_BOUND, Bound, ConfidenceBound, ConstantBound, Situation, decide
+from bayespbrl.improvement.schedules import (
+    LEAST_BOUND,
+    SCHEDULES,
+    Bound,
+    ConfidenceBound,
+    ConstantBound,
+    Situation,
+    decide,
+)
 from bayespbrl.improvement.update import ProposedUpdate
 
 NUMBER = 400
@@ -130,7 +138,7 @@ def test_a_schedule_that_decides_nonsense_is_named(value):
     def careless(situation):
         return value
 
-    with pytest.raises(ValueError, match="schedule careless: expected a positive finite KL bound, got"):
+    with pytest.raises(ValueError, match="schedule careless, KL bound: expected a positive finite number, got"):
         decide(careless, situation(proposed()))
 
 
@@ -157,6 +165,19 @@ def test_a_reason_that_is_no_text_and_statistics_without_names_are_refused(bound
 def test_statistics_may_be_flags_texts_and_lists():
     statistics = {"sure": np.bool_(True), "why": "x", "gains": [1.0, np.float64(2.0)], "none": None}
     assert decide(lambda situation: Bound(0.2, "mine", 0.5, statistics), situation(proposed())).statistics == statistics
+
+
+@pytest.mark.parametrize("needs_draws", [True, False])
+def test_a_schedule_that_needs_no_draws_says_so_and_gets_none(needs_draws):
+    seen = []
+
+    def own(situation):
+        seen.append(situation.update.q_draws is not None and situation.update.q_halves is not None)
+        return 0.2
+
+    own.needs_draws = needs_draws
+    Learner("gridworld", schedule=own, iterations=1, answers=2, max_steps=20, evaluation_episodes=2).run(ReturnExpert())
+    assert seen == [needs_draws]
 
 
 @pytest.mark.parametrize("largest", [0.0, -1.0, float("nan"), float("inf")])
@@ -194,6 +215,16 @@ def test_the_bound_follows_the_posterior_of_a_run_and_comes_from_the_same_choice
         assert 0 <= summary["schedule"]["signal"] <= 1
         assert 0 <= summary["schedule"]["agreement"] <= 1
         assert summary["schedule"]["rhat_max"] == summary["rhat_max"]
+
+
+def test_a_schedule_named_in_schedules_is_used_by_that_name(tmp_path, monkeypatch):
+    monkeypatch.setitem(SCHEDULES, "by-the-clock", three_lines)
+    start("gridworld", tmp_path / "run", schedule="by-the-clock", iterations=2, **QUICK)
+    whole = resume(tmp_path / "run").run(ReturnExpert())  # the name alone says which
+    assert [summary["schedule"]["reason"] for summary in whole.iterations] == ["by the clock"] * 2
+    monkeypatch.delitem(SCHEDULES, "by-the-clock")
+    with pytest.raises(ValueError, match=r"^schedule: expected one of .*, got 'by-the-clock'$"):
+        Learner("gridworld", schedule="by-the-clock")
 
 
 def test_a_schedule_of_the_users_own_has_to_be_given():

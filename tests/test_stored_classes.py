@@ -42,6 +42,14 @@ def through_a_file(instance, tmp_path, known=()):
         return from_tree(tree.load().children["instance"], known=known)
 
 
+def test_a_field_that_was_left_out_has_to_be_given(tmp_path):
+    tree = to_tree(Inner(np.arange(3.0)), without=("values",))
+    assert not tree.data_vars
+    assert list(from_tree(tree, known=(Inner,), given={"values": np.ones(2)}).values) == [1.0, 1.0]
+    with pytest.raises(ValueError, match="stored class: the fields do not fit Inner"):
+        from_tree(tree, known=(Inner,))
+
+
 def test_everything_comes_back_exactly(tmp_path):
     rng = np.random.default_rng(0)
     instance = Outer(

@@ -123,7 +123,7 @@ BAD = [
     ("[tasks]", "at least one task"),
     ("trials = 0\n[tasks.gridworld]", "trials: expected a whole number >= 1"),
     ("[tasks.gridworld]\nspeed = 3", "tasks.gridworld: expected entries among .*, got speed"),
-    ("[tasks.gridworld]\nminutes = 'long'", "minutes: expected a number"),
+    ("[tasks.gridworld]\nminutes = 'long'", "minutes: expected a finite number"),
     ("[options]\nseed = 4\n[tasks.gridworld]", "options: expected entries among .*, got seed"),
     ("levels = 3\n[tasks.gridworld]", "expected entries among .*, got levels"),
     ("[tasks.gridworld]\n[noise]\nfew = 3", "noise.few: expected a table, got 3"),

@@ -17,7 +17,6 @@ from bayespbrl import Learner, ReturnExpert, load
 from bayespbrl.diagnostics.uncertainty import (
     greedy_probabilities,
     plot_greedy,
-    plot_q,
     plot_ranking,
     plot_returns,
     q_draws,
@@ -230,22 +229,18 @@ def test_the_greedy_action_is_counted_over_draws_and_equal_ones_share():
 
 def test_figures_are_drawn_on_the_axes_given_and_on_no_other():
     figure = Figure()
-    axes = figure.subplots(1, 5)
+    axes = figure.subplots(1, 4)
     returns = given_returns([[3, 2, 1], [3, 1, 2], [1, 2, 3], [9, 8, -7]])
     q = given_q(np.random.default_rng(0).normal(size=(20, 2, 3)))
     assert plot_returns(returns, axes[0]) is axes[0]
     assert plot_ranking(ranking_probabilities(returns), axes[1]) is axes[1]
-    assert plot_q(q, axes[2], state=1) is axes[2]
-    assert plot_greedy(greedy_probabilities(q), axes[3]) is axes[3]
+    assert plot_greedy(greedy_probabilities(q), axes[2]) is axes[2]
     FigureCanvasAgg(figure).draw()
-    assert not axes[4].has_data()
-    assert [a.get_title() for a in axes[2:4]] == [
-        "Q in state 1 (the fit has not converged)",
-        "Best action (the fit has not converged)",
-    ]
+    assert not axes[3].has_data()
+    assert axes[2].get_title() == "Best action (the fit has not converged)"
     assert axes[0].get_title() == "Returns"
     assert [label.get_text() for label in axes[1].get_yticklabels()] == ["0 (75%)", "1 (0%)", "2 (25%)"]
-    assert [label.get_text() for label in axes[3].get_xticklabels()] == ["10", "20", "30"]
+    assert [label.get_text() for label in axes[2].get_xticklabels()] == ["10", "20", "30"]
     assert matplotlib.pyplot.get_fignums() == []
 
 
@@ -281,10 +276,8 @@ def test_no_states_or_no_actions_are_refused(states, actions):
         q_draws(SimpleNamespace(estimate=fitted()), states, actions)
 
 
-def test_no_trajectories_no_draws_and_an_unknown_state_are_refused():
+def test_no_trajectories_and_no_draws_are_refused():
     with pytest.raises(ValueError, match="trajectory_features: expected at least one trajectory"):
         return_draws(fitted(), [])
     with pytest.raises(ValueError, match="number: expected a whole number >= 1, got 0"):
         return_draws(fitted(), TRAJECTORIES, number=0)
-    with pytest.raises(ValueError, match=r"state: expected a number in 0 … 1, got 2"):
-        plot_q(given_q(np.zeros((4, 2, 3))), Figure().subplots(), state=2)

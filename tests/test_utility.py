@@ -187,10 +187,10 @@ def test_the_mean_is_the_mean_of_the_draws_over_all_settings(walked):
     # but for the directions that no answer touches, which are drawn from the prior
     np.testing.assert_allclose(mean, draws.mean(axis=0), atol=5 * draws.std(axis=0).max() / np.sqrt(len(draws)))
     np.testing.assert_allclose(
-        estimate.trajectory_utilities(walks[:2]) @ [1, -1], estimate.margin_draws(*walks[:2]).mean(), rtol=1e-9
+        estimate.trajectory_utilities(walks[:2]) @ [1, -1], (estimate.trajectory_draws(walks[:2]) @ [1, -1]).mean()
     )
     np.testing.assert_allclose(
-        estimate.margin_draws(*walks[:2]),
+        estimate.trajectory_draws(walks[:2]) @ [1, -1],
         estimate.posterior["posterior"]["margins"].values[:, :, 0].ravel(),
         rtol=1e-9,
         atol=1e-12,
@@ -293,11 +293,15 @@ def test_without_a_posterior_there_are_no_draws_and_no_likelihood():
     for name, arguments in {
         "likelihood": (),
         "trajectory_draws": ([one],),
-        "margin_draws": (one, other),
+        "tie_thresholds": (),
+        "differences": ([one, other],),
+        "mean_utilities": (np.arange(3),),
+        "prior_deviations": (np.arange(3),),
         "utilities_and_draws": (np.arange(3),),
     }.items():
         with pytest.raises(ValueError, match=f"{name}: expected an estimate with a posterior, got Linear"):
             getattr(estimate, name)(*arguments)
+    assert estimate.thinned(2) is estimate
 
 
 def test_the_linear_program_reaches_the_optimum_that_scipy_finds():
@@ -326,6 +330,9 @@ def test_the_linear_program_reaches_the_optimum_that_scipy_finds():
 def test_the_known_reward_is_the_hidden_reward_itself():
     estimate = estimate_utility(TRAJECTORIES, [(2, 0), (0, 1)], ONE_HOT, method="known-reward", discount=0.9)
     assert isinstance(estimate, KnownReward)
+    assert (estimate.features, estimate.number_of_features) == (None, 0)
+    with pytest.raises(ValueError, match="utilities: expected a utility of states, got KnownReward"):
+        estimate.utilities(np.arange(3))
     np.testing.assert_array_equal(estimate.step_utilities(transitions(TRAJECTORIES[:2])), [-1] * 4 + [0.5] * 4)
     np.testing.assert_array_equal(estimate.trajectory_utilities(TRAJECTORIES), [-4, 2, 8, 4])
     assert (estimate.quality.pairs, estimate.quality.pairs_satisfied) == (2, 1)

@@ -1,4 +1,4 @@
-"""The command line: `bayespbrl run`, `resume`, `ask`, `report`, `trials`."""
+"""The command line: `bayespbrl run`, `resume`, `ask`, `report`, `trials`, `study`, `results`."""
 
 from bayespbrl.cli.commands import main
 

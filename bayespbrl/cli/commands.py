@@ -22,6 +22,7 @@ from bayespbrl.cli.display import (
     show_trials,
 )
 from bayespbrl.cli.studies import run_study, show_plan
+from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.experts import SIMULATED
 from bayespbrl.runs.directory import fresh_directory
 from bayespbrl.runs.lock import continuing
@@ -50,7 +51,7 @@ Practice = Annotated[
 ImportPackage = Annotated[
     bool, typer.Option("--import-package", help="Import the package that the run's environment names (it runs code).")
 ]
-Env = Annotated[str, typer.Argument(help="gridworld, bicycle, swing-up, acrobot, or any gymnasium id.")]
+Env = Annotated[str, typer.Argument(help=f"{', '.join(SHORT_NAMES)}, or any gymnasium id.")]
 
 
 # The options of a run and of each trial, with their help. One left out has the value of the environment's preset.

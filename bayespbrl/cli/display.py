@@ -11,7 +11,9 @@ from rich.table import Column, Table
 
 from bayespbrl.envs.opening import environment_attribute, open_environment
 from bayespbrl.experts import TerminalExpert
+from bayespbrl.figures import new_figure, png
 from bayespbrl.learner import Learner
+from bayespbrl.runs.files import write_file
 from bayespbrl.runs.film import film_policy
 from bayespbrl.runs.simulated import expert_of
 from bayespbrl.studies import Trials
@@ -103,7 +105,7 @@ def show_run(learner: Learner, directory: Path) -> None:
     if learner.comparable_starts is False:
         console.print("Equal seeds did not start alike here: trajectories from different starts were compared.")
     film, picture = _film(learner, directory), directory / PICTURE
-    run_figure(learner).savefig(picture, dpi=110)
+    write_file(picture, png(run_figure(learner)))
     console.print(f"Run directory: {directory}\nPicture: {picture}\n{film}")
 
 
@@ -147,16 +149,14 @@ def _state(learner: Learner) -> str:
 
 def _person(learner: Learner, directory: Path) -> TerminalExpert:
     """The person at this terminal, who looks at a picture of the two trajectories."""
-    from matplotlib.figure import Figure
-
     from bayespbrl.envs.pictures import draw_trajectory
 
     def draw(first: Trajectory, second: Trajectory, path: Path) -> None:
-        figure = Figure(figsize=(11, 5), layout="constrained")
+        figure = new_figure(11, 5)
         for axes, trajectory, name in zip(figure.subplots(1, 2), (first, second), ("first", "second"), strict=True):
             draw_trajectory(learner.environment, trajectory, axes)
             axes.set_title(f"{name}: {axes.get_title()}")
-        figure.savefig(path, dpi=100)
+        write_file(path, png(figure, dpi=100))
 
     return TerminalExpert(draw, directory)
 
@@ -214,7 +214,7 @@ def show_trials(study: Trials) -> None:
     _print_numerics(table)
     console.print(f"Tables: {study.path / 'trials.csv'}, {study.path / 'trials.nc'}")
     picture = study.path / "trials.png"
-    trials_figure(quartiles, environment, title).savefig(picture, dpi=110)
+    write_file(picture, png(trials_figure(quartiles, environment, title)))
     console.print(f"Picture: {picture}")
 
 

@@ -7,10 +7,12 @@ from matplotlib.axes import Axes
 
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
-from bayespbrl.models.convergence import chain_convergence
+from bayespbrl.models.convergence import RHAT_LIMIT, SIZE_LIMIT, chain_convergence
 
 
-def convergence(tree: xr.DataTree, *, rhat_max: float = 1.01, effective_sample_size_min: float = 400.0) -> xr.Dataset:
+def convergence(
+    tree: xr.DataTree, *, rhat_max: float = RHAT_LIMIT, effective_sample_size_min: float = SIZE_LIMIT
+) -> xr.Dataset:
     """Convergence diagnostics of each margin.
 
     Args:

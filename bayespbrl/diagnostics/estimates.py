@@ -1,23 +1,20 @@
 """What the diagnostics ask of a utility estimate: its posterior, and whether it is a utility of states."""
 
-from typing import TypeGuard
-
 import numpy as np
+from xarray import DataTree
 
 from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
 from bayespbrl.models import Answers
 from bayespbrl.models.posterior_tree import answers_of
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEstimate
-
-StateUtility = PosteriorUtility | LinearProgramUtility
+from bayespbrl.utility import UtilityEstimate
 
 
-def expect_posterior(estimate: UtilityEstimate | None) -> PosteriorUtility:
-    """`estimate`; `ValueError` where it has no posterior."""
-    if not isinstance(estimate, PosteriorUtility):
+def expect_posterior(estimate: UtilityEstimate | None) -> tuple[UtilityEstimate, DataTree]:
+    """`estimate` and its posterior; `ValueError` where it has none."""
+    if estimate is None or estimate.posterior is None:
         raise ValueError(f"estimate: expected one with a posterior, got {type(estimate).__name__} without")
-    return estimate
+    return estimate, estimate.posterior
 
 
 def expect_estimate(estimate: UtilityEstimate | None) -> UtilityEstimate:
@@ -25,16 +22,6 @@ def expect_estimate(estimate: UtilityEstimate | None) -> UtilityEstimate:
     if estimate is None:
         raise ValueError("estimate: expected a utility estimate, got none yet")
     return estimate
-
-
-def of_states(estimate: UtilityEstimate | None) -> TypeGuard[StateUtility]:
-    """Whether it is a utility of states, as every estimate is but the known reward."""
-    return isinstance(estimate, StateUtility)
-
-
-def number_of_features(estimate: StateUtility) -> int:
-    """D."""
-    return int(estimate.weights.shape[-1])
 
 
 def first_preferred_probability(
@@ -46,9 +33,9 @@ def first_preferred_probability(
       estimate: with a posterior.
       answerer: who is asked; a name that the posterior does not know, or None, is any of its answerers.
     """
-    posterior = expect_posterior(estimate)
-    names = answers_of(posterior.posterior).names or ()
+    estimate, posterior = expect_posterior(estimate)
+    names = answers_of(posterior).names or ()
     who = np.array([answerer]) if answerer in names else None
     answers = Answers(shown_first=np.ones(1, int), answerers=who)
-    differences = posterior.differences([first, second])
-    return float(answer_probabilities(posterior.posterior, differences, answers)[0, PREFERRED])
+    differences = estimate.differences([first, second])
+    return float(answer_probabilities(posterior, differences, answers)[0, PREFERRED])

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from bayespbrl.diagnostics.axes import number_cells
 from bayespbrl.diagnostics.estimates import expect_estimate
 from bayespbrl.envs.opening import environment_attribute
+from bayespbrl.figures import new_figure
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Transitions, transitions
 
@@ -56,7 +57,7 @@ def quartile_curve(quartiles: xr.Dataset, axes: Axes, *, levels: Mapping[str, fl
 
 def trials_figure(quartiles: xr.Dataset, environment: gymnasium.Env, title: str) -> Figure:
     """`quartile_curve` with the environment's published returns and its optimum, where it has them."""
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    figure = new_figure(7, 4.5)
     levels = dict(environment_attribute(environment, "published_returns") or {})
     optimum = environment_attribute(environment, "optimal_return")
     axes = quartile_curve(
@@ -89,7 +90,7 @@ def utility_beside_reward(learner: Learner, utility_axes: Axes, reward_axes: Axe
 
 def run_figure(learner: Learner) -> Figure:
     """The learning curve, and the inferred utility beside the hidden reward, as one figure."""
-    figure = Figure(figsize=(13, 4), layout="constrained")
+    figure = new_figure(13, 4)
     curve, utility, reward = figure.subplots(1, 3)
     learning_curve(learner.iterations, curve, optimum=environment_attribute(learner.environment, "optimal_return"))
     utility_beside_reward(learner, utility, reward)

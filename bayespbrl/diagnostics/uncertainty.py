@@ -15,13 +15,12 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 from scipy.stats import rankdata
 
-from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.estimates import expect_posterior
 from bayespbrl.improvement.q_function import Evidence, estimate_q
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Trajectory, transitions
-from bayespbrl.utility import PosteriorUtility, UtilityEstimate
+from bayespbrl.utility import UtilityEstimate
 from bayespbrl.utility.posterior_utility import spacing
 
 # Quantiles and line widths of the intervals in the figures, which hold 50 % and 90 % of the draws.
@@ -44,9 +43,9 @@ def return_draws(
     Raises:
       ValueError: an estimate without a posterior; no trajectories; a number < 1.
     """
-    fit = expect_posterior(estimate)
+    fit, posterior = expect_posterior(estimate)
     draws = fit.trajectory_draws(trajectories, number=number)
-    chains = fit.posterior["posterior"].sizes["chain"]
+    chains = posterior["posterior"].sizes["chain"]
     return xr.Dataset(
         {"returns": (("chain", "draw", "trajectory"), draws.reshape(chains, -1, len(trajectories)))},
         {"trajectory": np.arange(len(trajectories))},
@@ -110,7 +109,7 @@ def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: 
     Raises:
       ValueError: a learner without an estimate that has a posterior; no states or no actions.
     """
-    fit, states, actions = expect_posterior(learner.estimate), np.asarray(states), np.asarray(actions)
+    (fit, posterior), states, actions = expect_posterior(learner.estimate), np.asarray(states), np.asarray(actions)
     if states.ndim == 0 or actions.ndim == 0 or not (len(states) and len(actions)):
         raise ValueError(f"states, actions: expected at least one row each, got {states.shape} and {actions.shape}")
     steps = transitions(learner.trajectories)
@@ -126,7 +125,7 @@ def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: 
         critic=learner.settings.critic,
     )
     rows = q(np.repeat(states, len(actions), axis=0), np.concatenate([actions] * len(states)))
-    shape = (fit.posterior["posterior"].sizes["chain"], -1, len(states), len(actions))
+    shape = (posterior["posterior"].sizes["chain"], -1, len(states), len(actions))
     labels = actions.reshape(len(actions), -1)
     return xr.Dataset(
         {"q": (("chain", "draw", "state", "action"), rows.T.reshape(shape))},
@@ -168,7 +167,7 @@ def plot_returns(returns: xr.Dataset, axes: Axes) -> Axes:
     values = _pooled(returns["returns"])
     values = values - values.mean(axis=1, keepdims=True)
     order = np.argsort(np.median(values, axis=0), kind="stable")
-    _intervals(values[:, order], np.arange(len(order)), axes, horizontal=True)
+    _intervals(values[:, order], np.arange(len(order)), axes)
     axes.set_yticks(np.arange(len(order)), [str(label) for label in returns["trajectory"].values[order]])
     axes.axvline(0.0, color="0.5", linestyle="--", linewidth=1)
     axes.set_title(_titled("Returns", returns))
@@ -189,30 +188,6 @@ def plot_ranking(ranking: xr.Dataset, axes: Axes) -> Axes:
     )
     title = _titled("Ranking", ranking)
     return finished(axes, xlabel="rank", ylabel="trajectory (probability to be best)", title=title)
-
-
-def plot_q(q: xr.Dataset, axes: Axes, *, state: int = 0) -> Axes:
-    """Intervals of Q(s, a) relative to the mean over actions, which does not matter to the choice.
-
-    Args:
-      q: what `q_draws` returned.
-      axes: to draw on.
-      state: the number of the state.
-
-    Raises:
-      ValueError: an unknown state.
-    """
-    state = checks.index("state", state, q.sizes["state"])
-    values = _pooled(q["q"].isel(state=state))
-    values = values - values.mean(axis=1, keepdims=True)
-    actions = q["action"].values
-    _intervals(values, actions, axes, horizontal=False)
-    if not np.issubdtype(actions.dtype, np.floating):
-        axes.set_xticks(actions)
-    axes.axhline(0.0, color="0.5", linestyle="--", linewidth=1)
-    label = "Q relative to the mean (units of the utility)"
-    axes.set(xlabel="action", ylabel=label, title=_titled(f"Q in state {state}", q))
-    return axes
 
 
 def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
@@ -239,7 +214,7 @@ def thinned(tree: xr.DataTree, number: int) -> xr.DataTree:
     return tree.isel(draw=slice(None, None, spacing(sizes["chain"] * sizes["draw"], number)))
 
 
-def _convergence(fit: PosteriorUtility) -> dict[str, float]:
+def _convergence(fit: UtilityEstimate) -> dict[str, float]:
     return {"converged": int(fit.quality.converged), "rhat_max": float(fit.quality.rhat_max)}
 
 
@@ -253,10 +228,7 @@ def _titled(title: str, result: xr.Dataset) -> str:
     return title if result.attrs.get("converged", 1) else f"{title} (the fit has not converged)"
 
 
-def _intervals(values: np.ndarray, places: np.ndarray, axes: Axes, *, horizontal: bool) -> None:
-    lines = axes.hlines if horizontal else axes.vlines
+def _intervals(values: np.ndarray, places: np.ndarray, axes: Axes) -> None:
     for low, high, width in INTERVALS:
-        lines(places, *np.quantile(values, [low, high], axis=0), linewidth=width, color="tab:blue")
-    medians = np.median(values, axis=0)
-    across = (medians, places) if horizontal else (places, medians)
-    axes.plot(*across, "o", color="white", markeredgecolor="tab:blue", markersize=5)
+        axes.hlines(places, *np.quantile(values, [low, high], axis=0), linewidth=width, color="tab:blue")
+    axes.plot(np.median(values, axis=0), places, "o", color="white", markeredgecolor="tab:blue", markersize=5)

@@ -1,24 +1,16 @@
-"""The environments of the paper, registered with gymnasium on import.
+"""The environments of the paper, registered with gymnasium on import."""
 
-| short name | gymnasium id             | dynamics            |
-|------------|--------------------------|---------------------|
-| gridworld  | `bayespbrl/Gridworld-v0` | `GridworldDynamics` |
-| bicycle    | `bayespbrl/Bicycle-v0`   | `BicycleDynamics`   |
-| swing-up   | `bayespbrl/SwingUp-v0`   | `SwingUpDynamics`   |
-| acrobot    | `bayespbrl/Acrobot-v0`   | `AcrobotDynamics`   |
-"""
-
-from typing import Any
+from importlib import import_module
 
 import gymnasium
 
-from bayespbrl.envs import acrobot, bicycle, gridworld, swing_up
 from bayespbrl.envs.acrobot import AcrobotDynamics
 from bayespbrl.envs.bicycle import BicycleDynamics
 from bayespbrl.envs.functional import FunctionalEnv
 from bayespbrl.envs.gridworld import GridworldDynamics
 from bayespbrl.envs.swing_up import SwingUpDynamics
 
+# A short name says the module, its id the class in it: "swing-up" is `SwingUp` of `envs/swing_up.py`.
 SHORT_NAMES = {
     "gridworld": "bayespbrl/Gridworld-v0",
     "bicycle": "bayespbrl/Bicycle-v0",
@@ -26,15 +18,15 @@ SHORT_NAMES = {
     "acrobot": "bayespbrl/Acrobot-v0",
 }
 
-_MODULES: dict[str, Any] = {"Gridworld": gridworld, "Bicycle": bicycle, "SwingUp": swing_up, "Acrobot": acrobot}
-
 
 def register() -> None:
     """Register the environments with gymnasium; harmless when they are already there."""
-    for name, module in _MODULES.items():
-        if (identity := f"bayespbrl/{name}-v0") not in gymnasium.registry:
+    for short, identity in SHORT_NAMES.items():
+        if identity not in gymnasium.registry:
+            module = import_module(f"{__name__}.{short.replace('-', '_')}")
+            entry_point = f"{module.__name__}:{identity.removeprefix('bayespbrl/').removesuffix('-v0')}"
             steps = module.DYNAMICS.max_episode_steps
-            gymnasium.register(id=identity, entry_point=f"{module.__name__}:{name}", max_episode_steps=steps)
+            gymnasium.register(id=identity, entry_point=entry_point, max_episode_steps=steps)
 
 
 register()

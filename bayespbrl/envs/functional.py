@@ -15,6 +15,8 @@ from gymnasium.experimental.functional import FuncEnv
 from jax import Array
 from jaxtyping import Key, UInt8
 
+from bayespbrl.figures import new_figure, pixels
+
 
 def reset(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Any, Any]:
     """Start an episode: `(state, observation)`. Traceable; follows its caller's dtype."""
@@ -107,11 +109,6 @@ def picture(
     draw: Callable[[Any], Any], *, inches: tuple[float, float] = (4.0, 4.0)
 ) -> UInt8[np.ndarray, "height width 3"]:
     """What `draw(axes)` draws, without matplotlib's global state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=inches, dpi=80)
-    canvas = FigureCanvasAgg(figure)
-    draw(figure.add_axes((0.12, 0.1, 0.83, 0.82)))  # a computed layout costs more than the drawing
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    figure = new_figure(*inches, layout=None, dpi=80)  # a computed layout costs more than the drawing
+    draw(figure.add_axes((0.12, 0.1, 0.83, 0.82)))
+    return pixels(figure)[..., :3].copy()

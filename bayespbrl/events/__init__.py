@@ -7,7 +7,9 @@ Resuming a run, undoing an answer and reporting on a run in progress all use thi
 * `asked`: a question, with the order in which the two trajectories were shown, the number of the earlier question that
   it `repeats`, if any, and the `answerer` who is asked, where several people answer at once;
 * `answered`: the expert's answer; `answerer`, the name of who gave it, and `seconds`, the time they took, where known;
-* `improved`: a new estimate and a new policy (steps 1 and 2), which end an iteration;
+* `improved`: a new estimate and a new policy (steps 1 and 2), which end an iteration: the `check` of the policy before
+  it, the number of the policy that is `kept`, the decision on the KL `bound`, the `value` of the new policy, and the
+  `summary` for reports, which the learner never reads;
 * `undone`: the last answer and everything after it is taken back.
 
 state                    what the learner knows between two calls

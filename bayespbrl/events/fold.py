@@ -30,32 +30,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
         case "answered":
             return _answered(state, event)
         case "improved":
-            summary = _with_figures(event["summary"])
-            iteration, check = operator.index(event["iteration"]), summary.get("check")  # of a checked update
-            best = iteration if check is None else operator.index(check["best"])
-            kept = operator.index(summary.get("kept", best))
-            if check is not None and best not in (state.best, state.iteration):
-                raise ValueError(f"improved: expected {state.best} or {state.iteration} as the best, got {best}")
-            if kept not in (best, iteration, *(() if state.restart is None else (state.restart.number,))):
-                raise ValueError(f"improved: expected policy {best} or {iteration} to be kept, got {kept}")
-            last_is_best = best == state.iteration
-            return replace(
-                state,
-                policy=entry.parts["policy"],
-                best_policy=state.policy if last_is_best else state.best_policy,
-                best=best,
-                kept=kept,
-                tried=tuple(entry.parts.get("tried", ())),
-                best_tried=state.tried if last_is_best else state.best_tried,
-                trust=1.0 if check is None else float(check["trust"]),
-                estimate=entry.parts["estimate"],
-                bound=Bound.recalled(event["summary"]["kl_bound"], event["summary"]["schedule"]),
-                iteration=iteration,
-                collected=False,
-                candidates=(),
-                wanted=0,
-                summaries=(*state.summaries, event["summary"]),
-            )
+            return _improved(state, event, entry.parts)
         case "undone":
             if (before := state.previous) is None:
                 got = f"{MOST_UNDONE} undone" if state.past else "none yet"
@@ -80,11 +55,45 @@ def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
     return state
 
 
-def _with_figures(summary: Any) -> Mapping[str, Any]:
-    """`summary`, where it has what all its readers need; `ValueError` where it has not."""
-    if not has_figures(summary):
-        raise ValueError(f"improved: expected a summary with answers and value, got {str(summary)[:60]}")
-    return dict(summary)
+def _improved(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:
+    if not has_figures(event["summary"]):
+        raise ValueError(f"improved: expected a summary with answers and value, got {str(event['summary'])[:60]}")
+    iteration, found = operator.index(event["iteration"]), event if "bound" in event else _by_summary(event["summary"])
+    check = found["check"]  # of a checked update
+    best = iteration if check is None else operator.index(check["best"])
+    kept = best if found["kept"] is None else operator.index(found["kept"])
+    if check is not None and best not in (state.best, state.iteration):
+        raise ValueError(f"improved: expected {state.best} or {state.iteration} as the best, got {best}")
+    if kept not in (best, iteration, *(() if state.restart is None else (state.restart.number,))):
+        raise ValueError(f"improved: expected policy {best} or {iteration} to be kept, got {kept}")
+    last_is_best = best == state.iteration
+    return replace(
+        state,
+        policy=parts["policy"],
+        best_policy=state.policy if last_is_best else state.best_policy,
+        best=best,
+        kept=kept,
+        tried=tuple(parts.get("tried", ())),
+        best_tried=state.tried if last_is_best else state.best_tried,
+        trust=1.0 if check is None else float(check["trust"]),
+        estimate=parts["estimate"],
+        bound=Bound(**found["bound"]),
+        values=(*state.values, float(found["value"])),
+        iteration=iteration,
+        collected=False,
+        candidates=(),
+        wanted=0,
+        summaries=(*state.summaries, event["summary"]),
+    )
+
+
+def _by_summary(summary: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What `improved` has beside its summary, for a log of earlier versions, where only the summary has it."""
+    figures = {name: value for name, value in summary["schedule"].items() if name not in ("reason", "signal")}
+    said = {"reason": summary["schedule"].get("reason", ""), "signal": summary["schedule"].get("signal")}
+    bound = {"kl_bound": summary["kl_bound"], **said, "statistics": figures}
+    value = summary.get("value_newest", summary["value"])
+    return {"check": summary.get("check"), "kept": summary.get("kept"), "bound": bound, "value": value}
 
 
 def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:
@@ -129,8 +138,7 @@ def _asked(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     compared = state.compared
     both = (compared[shown[0]], compared[shown[1]])
     rivals, answerer = event.get("rivals"), event.get("answerer")
-    if answerer is not None:
-        checks.short_name("answerer", answerer)
+    checks.optional(checks.short_name, "answerer", answerer)
     if rivals is None and event["newcomer"] in shown and repeats is None:
         incumbent = shown[shown[0] == event["newcomer"]]
         newest = incumbent in state.preferences.undominated[-1:]
@@ -146,10 +154,8 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         waiting = [waiting.number for waiting in state.open]
         raise ValueError(f"answered: expected an answer to an open question of {waiting}, got one to {event['query']}")
     answer, answerer, seconds = parse_answer(event["answer"]), event.get("answerer"), event.get("seconds")
-    if answerer is not None:
-        checks.short_name("answerer", answerer)
-    if seconds is not None:
-        checks.non_negative("seconds", seconds)
+    checks.optional(checks.short_name, "answerer", answerer)
+    checks.optional(checks.non_negative, "seconds", seconds)
     left, again = state.candidates, query.repeats is not None
     if not again:
         left = tuple(number for number in left if number != query.newcomer)

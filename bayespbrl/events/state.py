@@ -44,6 +44,7 @@ class LearnerState:
       restart: when the policy was started anew, and what was kept by then; None: it was not.
       estimate: the last utility estimate; None before the first.
       bound: the last decision on the KL bound; None before the first.
+      values: of each iteration's policy, by its number from 1, for reports alone.
       iteration: iterations completed.
       trajectories: all of them, by number.
       clips: first step and number of steps of the part of each that questions are about; () where they are about all.
@@ -74,6 +75,7 @@ class LearnerState:
     restart: Restart | None = None
     estimate: UtilityEstimate | None = None
     bound: Bound | None = None
+    values: tuple[float, ...] = ()
     iteration: int = 0
     trajectories: tuple[Trajectory, ...] = ()
     clips: tuple[tuple[int, int], ...] = ()

@@ -26,8 +26,8 @@ class PolicyUpdate:
 
     Attributes:
       kl_bound: ε of eq. 11, nats.
-      schedule: what decides on the bound of each iteration: `constant`, kl_bound itself; `confidence`, the posterior's
-        confidence that the update is a gain; `other`, a schedule of the user's.
+      schedule: what decides on the bound of each iteration, a name of `SCHEDULES` (`improvement.schedules`); `other` is
+        a schedule of the user's. `Settings` checks it.
       updates_per_iteration: most updates of the policy from the same trajectories and utility, until it has moved by
         most of the bound. Each has the Q of the policy before it; all but the first hold a continuous policy's spread.
         The paper's is 1.
@@ -57,14 +57,11 @@ class PolicyUpdate:
 
     def __post_init__(self) -> None:
         checks.positive("kl_bound", self.kl_bound)
-        checks.one_of("schedule", self.schedule, ("constant", "confidence", "other"))
         checks.whole("updates_per_iteration", self.updates_per_iteration)
         for name in ("recent_iterations", "critic_iterations"):
-            if getattr(self, name) is not None:
-                checks.whole(name, getattr(self, name))
+            checks.optional(checks.whole, name, getattr(self, name))
         checks.whole("update_states", self.update_states)
-        if not isinstance(self.checked, bool):
-            raise ValueError(f"checked: expected true or false, got {self.checked!r}")
+        checks.boolean("checked", self.checked)
         checks.whole("check_episodes", self.check_episodes, 2)
         checks.whole("restart_iterations", self.restart_iterations, 0)
 

@@ -15,7 +15,7 @@ from bayespbrl import checks
 from bayespbrl.features import StateActionFeatures
 from bayespbrl.improvement.lstd import TransitionSums, solve_lstd, transition_sums
 from bayespbrl.policies import clipped, is_discrete, sample_actions
-from bayespbrl.trajectories import Transitions
+from bayespbrl.trajectories import DISCOUNT, Transitions
 
 ROWS_AT_A_TIME = 16_384
 
@@ -29,7 +29,7 @@ class Critic:
       fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂ ≥ 0.
     """
 
-    discount: float = 0.98
+    discount: float = DISCOUNT
     fixed_point_ridge: float = 1e-8
     projection_ridge: float = 1e-8
 

@@ -117,7 +117,7 @@ def reps_weights(
 
     Source: paper, eqs. 11-13; Daniel, Neumann and Peters (2012) for the feature constraint.
     """
-    q, phi, base = _checked(q_values, state_features, base_weights, kl_bound)
+    q, phi, base = _checked_samples(q_values, state_features, base_weights, kl_bound)
     constraint = whitened(phi, base) if constraint is None else constraint
     features = constraint.features
     mean = base @ q
@@ -169,7 +169,7 @@ def reps_weights_by_state(
 
     Source: paper, eqs. 11-13, in the limit of features that tell all states apart.
     """
-    q, states, base = _checked(q_values, states, base_weights, kl_bound)
+    q, states, base = _checked_samples(q_values, states, base_weights, kl_bound)
     visits = np.bincount(states, weights=base)
     if np.any(visits == 0):
         raise ValueError(f"states: expected each of 0 … {len(visits) - 1}, got none of {np.argmin(visits)}")
@@ -248,7 +248,7 @@ def advantages(
     return np.zeros_like(q_values) if rounding else advantage
 
 
-def _checked(
+def _checked_samples(
     q_values: ArrayLike, states: ArrayLike, base_weights: ArrayLike, kl_bound: float
 ) -> tuple[PerSample, Shaped[np.ndarray, "n ..."], PerSample]:
     q_values, states, base_weights = np.asarray(q_values), np.asarray(states), np.asarray(base_weights)

@@ -7,10 +7,9 @@ with the `Situation` and returns the bound in nats, or a `Bound` with its reason
         return 0.5 if situation.update.agreement(0.5) > 0.9 else 0.1
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -58,18 +57,13 @@ class Bound:
     statistics: Mapping[str, float] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """Reason, signal and statistics as plain data; `recalled` reads them."""
+        """Reason, signal and statistics as plain data."""
         signal = {} if self.signal is None else {"signal": self.signal}
         return {"reason": self.reason, **signal, **self.statistics}
 
-    @classmethod
-    def recalled(cls, kl_bound: float, summary: Mapping[str, Any]) -> "Bound":
-        """The bound that `summary` describes."""
-        signal = summary.get("signal")
-        figures = {name: value for name, value in summary.items() if name not in ("reason", "signal")}
-        return cls(kl_bound, summary.get("reason", ""), signal, figures)
 
-
+# One that looks at neither the draws nor the halves of an update may have an attribute `needs_draws` that is False:
+# they are not computed then.
 Schedule = Callable[[Situation], "Bound | float"]
 
 
@@ -78,6 +72,7 @@ class ConstantBound:
     """The same bound at every iteration, the paper's schedule: the run's own where `kl_bound` is None."""
 
     kl_bound: float | None = None
+    needs_draws: ClassVar[bool] = False
 
     def __call__(self, situation: Situation) -> Bound:
         return Bound(situation.usual_bound if self.kl_bound is None else self.kl_bound, "constant")
@@ -142,10 +137,7 @@ def decide(schedule: Schedule, situation: Situation) -> Bound:
     name = f"schedule {getattr(schedule, '__name__', type(schedule).__name__)}"
     if not isinstance(bound, Bound):
         bound = Bound(bound, "by the user's own schedule")
-    value = bound.kl_bound
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"{name}: expected a positive finite KL bound, got {value!r}")
+    value = checks.positive(f"{name}, KL bound", bound.kl_bound)
     if not isinstance(bound.reason, str) or not isinstance(bound.statistics, Mapping):
         got = f"{bound.reason!r} and {bound.statistics!r}"
         raise ValueError(f"{name}: expected a reason in words and statistics by name, got {got}")
@@ -153,7 +145,7 @@ def decide(schedule: Schedule, situation: Situation) -> Bound:
         if not isinstance(key, str) or key in ("reason", "signal") or not _can_be_kept(figure):
             raise ValueError(f"{name}: expected statistics that are numbers by name, got {key!r}: {figure!r}")
     signal = None if bound.signal is None else checks.share(f"{name}, signal", bound.signal)
-    return Bound(float(value), bound.reason, signal, dict(bound.statistics))
+    return Bound(value, bound.reason, signal, dict(bound.statistics))
 
 
 def _can_be_kept(figure: Any) -> bool:

@@ -17,6 +17,7 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 ONE_BY_ONE = 100  # quantities up to which ArviZ's time does not matter
+RHAT_LIMIT, SIZE_LIMIT = 1.01, 400.0  # of every quantity of chains that have converged (Vehtari et al. 2021)
 AT_ONCE = 1_000_000  # numbers that are ranked at once, for the sake of memory
 
 
@@ -46,7 +47,7 @@ class Convergence:
         """The smallest effective sample size; infinite where there is nothing to estimate."""
         return float(np.min(self.effective_sample_size, initial=np.inf))
 
-    def converged(self, *, rhat_max: float = 1.01, effective_sample_size_min: float = 400.0) -> bool:
+    def converged(self, *, rhat_max: float = RHAT_LIMIT, effective_sample_size_min: float = SIZE_LIMIT) -> bool:
         """Whether every quantity meets both limits; NaN meets none."""
         return self.rhat_max <= rhat_max and self.effective_sample_size_min >= effective_sample_size_min
 

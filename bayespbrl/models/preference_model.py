@@ -40,12 +40,9 @@ class PreferenceModel:
     def __post_init__(self) -> None:
         checks.positive("prior_scale", self.prior_scale)
         checks.one_of("likelihood", self.likelihood, LIKELIHOODS)
-        if self.steepness is not None:
-            checks.positive("steepness", self.steepness)
-        if self.lapse_rate is not None:
-            checks.share("lapse_rate", self.lapse_rate, below_one=True)
-        if self.tie_threshold is not None:
-            checks.positive("tie_threshold", self.tie_threshold)
+        checks.optional(checks.positive, "steepness", self.steepness)
+        checks.optional(checks.share, "lapse_rate", self.lapse_rate, below_one=True)
+        checks.optional(checks.positive, "tie_threshold", self.tie_threshold)
 
     @property
     def steepness_prior(self) -> Grid:

@@ -12,6 +12,7 @@ from jaxtyping import Int
 from PIL import Image, ImageDraw
 
 from bayespbrl.envs.opening import environment_attribute
+from bayespbrl.figures import new_figure, pixels
 from bayespbrl.people.drawing import BLUE, GREY, ORANGE
 from bayespbrl.trajectories import Trajectory
 
@@ -48,19 +49,14 @@ def _columns(states: np.ndarray) -> np.ndarray:
 def _film(
     table: np.ndarray, limits: np.ndarray, names: Sequence[str], longest: int, shown: Int[np.ndarray, " f"]
 ) -> list[Image.Image]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=INCHES, dpi=DPI, layout="constrained")
+    figure = new_figure(*INCHES, dpi=DPI)
     figure.patch.set_alpha(0.0)
-    canvas = FigureCanvasAgg(figure)
     few = len(names) <= MOST_PANELS
     panels = _panels(figure, table, limits, names) if few else [_rows(figure, table, limits, names)]
     for axes in panels:
         axes.set_xlim(0, longest)
     panels[-1].set_xlabel("step", color=INK, fontsize=9)
-    canvas.draw()
-    ground = Image.fromarray(np.asarray(canvas.buffer_rgba()).copy())
+    ground = Image.fromarray(pixels(figure))
     top, bottom = panels[0].get_window_extent().y1, panels[-1].get_window_extent().y0
     pictures = []
     for index in shown:

@@ -67,12 +67,10 @@ class Session:
     ):
         if learner.finished:
             raise ValueError("learner: expected one with questions left, got a finished run")
-        if most_answers is not None:
-            checks.whole("answers", most_answers)
+        checks.optional(checks.whole, "answers", most_answers)
         names = [answerer] if answerer is None or isinstance(answerer, str) else list(answerer)
         for name in names:
-            if name is not None:
-                checks.short_name("answerer", name)
+            checks.optional(checks.short_name, "answerer", name)
         if not names or len(set(names)) < len(names):
             raise ValueError(f"answerer: expected a name for each person, got {names}")
         self.learner, self.most_answers = learner, most_answers
@@ -309,6 +307,5 @@ def answer_of(message: Any) -> tuple[int, str, float | None]:
     turn, answer, seconds = (message.get(name) for name in ("turn", "answer", "seconds"))
     if type(turn) is not int or not isinstance(answer, str):
         raise ValueError(f"answer: expected the number of a turn and an answer, got {turn!r} and {answer!r}"[:200])
-    if seconds is not None and (isinstance(seconds, bool) or not isinstance(seconds, int | float)):
-        raise ValueError("seconds: expected a number")
+    checks.optional(checks.number, "seconds", seconds)
     return turn, answer, seconds

@@ -15,7 +15,6 @@ from bayespbrl.models.likelihoods import Likelihood, prob
 from bayespbrl.people.clips import Clip
 from bayespbrl.preferences import Answer, Query
 from bayespbrl.settings import MOST_UNASKED
-from bayespbrl.utility.posterior_utility import PosteriorUtility
 
 View = Mapping[str, Any]
 INSTRUCTIONS, THINKING, QUESTION, FINISHED, FAILED = "instructions", "thinking", "question", "finished", "failed"
@@ -81,8 +80,7 @@ def said_of(query: Query, state: LearnerState) -> tuple[View, tuple[Answer, ...]
                 f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
             )
         likely = UNKNOWN if first >= 0.5 else (Answer.SECOND, Answer.FIRST, *UNKNOWN[2:])
-        if isinstance(state.estimate, PosteriorUtility):
-            likely = with_ties(likely, margins, likelihood, state.estimate.tie_thresholds(queries.QUERY_DRAWS))
+        likely = with_ties(likely, margins, likelihood, state.estimate.tie_thresholds(queries.QUERY_DRAWS))
     return said, likely
 
 

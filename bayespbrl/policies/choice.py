@@ -1,7 +1,6 @@
 """Which kind of policy suits an environment's spaces."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from gymnasium import Space
@@ -14,7 +13,19 @@ from bayespbrl.policies.policy import Policy
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
+Spaces = tuple[Space[Any], Space[Any]]  # of observations, of actions
 LEAST_EXPLORATION = 0.01  # share of a tabular policy's choices that stay uniform, which keeps REPS well-conditioned
+# The kinds of policies by name: from the spaces, the scale of continuous actions and the period of each observation.
+POLICIES: dict[str, Callable[[Spaces, float, ArrayLike | None], Policy]] = {
+    "tabular": lambda spaces, scale, period: TabularPolicy.initial(
+        *spaces, minimum_probability=float(LEAST_EXPLORATION / getattr(spaces[1], "n", 1))
+    ),
+    "softmax": lambda spaces, scale, period: SoftmaxPolicy.initial(*spaces, period=period),
+    "linear-gaussian": lambda spaces, scale, period: LinearGaussianPolicy.initial(*spaces, initial_scale=scale),
+    "gaussian-process": lambda spaces, scale, period: GaussianProcessPolicy.initial(
+        *spaces, period=period, initial_scale=scale
+    ),
+}
 
 
 def initial_policy(
@@ -28,8 +39,8 @@ def initial_policy(
     """The first policy of a run: as random as the action space allows.
 
     Args:
-      kind: `tabular`, `softmax`, `linear-gaussian`, `gaussian-process`, or `auto`: tabular for discrete states and
-        actions, softmax for discrete actions in continuous states, gaussian-process for continuous actions.
+      kind: a name of `POLICIES`, or `auto`: tabular for discrete states and actions, softmax for discrete actions in
+        continuous states, gaussian-process for continuous actions.
       action_scale: standard deviation of a continuous policy, in ranges of the action space.
       period: of each observation dimension, infinite where not periodic; None for none.
 
@@ -41,13 +52,6 @@ def initial_policy(
             kind = "gaussian-process"
         else:
             kind = "tabular" if isinstance(observation_space, Discrete) else "softmax"
-    least = float(LEAST_EXPLORATION / getattr(action_space, "n", 1))
-    kinds: dict[str, Callable[..., Policy]] = {
-        "tabular": partial(TabularPolicy.initial, minimum_probability=least),
-        "softmax": partial(SoftmaxPolicy.initial, period=period),
-        "linear-gaussian": partial(LinearGaussianPolicy.initial, initial_scale=action_scale),
-        "gaussian-process": partial(GaussianProcessPolicy.initial, period=period, initial_scale=action_scale),
-    }
-    if kind not in kinds:
-        raise ValueError(f"policy: expected auto, {', '.join(kinds)} to start from, got {kind!r}")
-    return kinds[kind](observation_space, action_space)
+    if kind not in POLICIES:
+        raise ValueError(f"policy: expected auto, {', '.join(POLICIES)} to start from, got {kind!r}")
+    return POLICIES[kind]((observation_space, action_space), action_scale, period)

@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from bayespbrl.figures import new_figure
 from bayespbrl.results.intervals import performance_profile
 from bayespbrl.results.study_data import StudyData
 
@@ -12,7 +13,7 @@ LEVELS = np.linspace(0, 1.1, 111)
 def curves_figure(data: StudyData) -> Figure:
     """Median and quartiles of the value over answers, one panel a task."""
     tasks = data.tasks
-    figure = Figure(figsize=(4.5 * len(tasks), 4), layout="constrained")
+    figure = new_figure(4.5 * len(tasks), 4)
     for axes, task in zip(np.atleast_1d(figure.subplots(1, len(tasks))), tasks, strict=True):
         for row in data.of_task(task):
             name = " ".join(level for level in row.declared.levels[1:] if level)
@@ -39,7 +40,7 @@ def profiles_figure(data: StudyData) -> Figure | None:
                 relative.setdefault(name, {})[task] = (row.final - scale[0]) / (scale[1] - scale[0])
     if not relative:
         return None
-    figure = Figure(figsize=(6, 4), layout="constrained")
+    figure = new_figure(6, 4)
     axes = figure.subplots()
     for name, tasks in relative.items():
         profile = performance_profile(tasks, LEVELS)

@@ -9,7 +9,7 @@ import pandas as pd
 from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.preferences import Answer
 from bayespbrl.results.study_data import ANSWER_COLUMNS
-from bayespbrl.runs.files import written_aside
+from bayespbrl.runs.files import write_file
 from bayespbrl.studies.processes import trial_processes
 from bayespbrl.studies.study import Study
 
@@ -40,9 +40,8 @@ def write_predictions(study: Study) -> Path:
         for answer in answers
     ]
     file = study.directory / "answers.csv"
-    with written_aside(file) as aside:
-        table = pd.DataFrame(lines, columns=ANSWER_COLUMNS)
-        table.to_csv(aside, index=False, lineterminator="\n", float_format="%.6g")
+    table = pd.DataFrame(lines, columns=ANSWER_COLUMNS)
+    write_file(file, table.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
     return file
 
 

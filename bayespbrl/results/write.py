@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pandas as pd
 
+from bayespbrl.figures import png
 from bayespbrl.results.figures import curves_figure, profiles_figure
 from bayespbrl.results.predictions import write_predictions
 from bayespbrl.results.study_data import StudyData, read_study
 from bayespbrl.results.tables import MISSING, calibration_table, kept_table, markdown, runs_table, values_table
-from bayespbrl.runs.files import write_file, written_aside
+from bayespbrl.runs.files import write_file
 from bayespbrl.studies.declaration import parsed
 from bayespbrl.studies.study import Study, read_study_json
 
@@ -82,13 +83,12 @@ def write_results(directory: Path | str, out: Path | str | None = None) -> list[
     written, sections = [], [f"# {data.declaration.title}"]
     for name, table in tables_of(data).items():
         written.append(out / f"{name}.csv")
-        with written_aside(written[-1]) as aside:
-            table.to_csv(aside, index=False, lineterminator="\n")
+        write_file(written[-1], table.to_csv(index=False, lineterminator="\n"))
         sections += [f"## {TITLES[name]}", section(data, name, table)]
     for name, figure in (("curves", curves_figure(data)), ("profiles", profiles_figure(data))):
         if figure is not None:
             written.append(out / f"{name}.png")
-            figure.savefig(written[-1], dpi=110)
+            write_file(written[-1], png(figure))
             sections.append(f"![{name}]({name}.png)")
     write_file(out / "results.md", "\n\n".join(sections) + "\n")
     return [out / "results.md", *written]

@@ -1,5 +1,6 @@
 """The netCDF file of one iteration: its trajectories, the policy and what was tried of it, the utility estimate."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from bayespbrl.models import restored, stored
 from bayespbrl.runs.files import NETCDF, write_netcdf
 from bayespbrl.runs.stored_classes import from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility import LinearProgramUtility, PosteriorUtility, UtilityEstimate
+from bayespbrl.utility import UtilityEstimate
 
 POSTERIOR_GROUPS = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 MOST_BYTES_A_BYTE = 16  # arrays of a file in bytes, by its size
@@ -128,47 +129,29 @@ def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
 
 def _estimate_groups(estimate: UtilityEstimate) -> dict[str, xr.DataTree]:
     """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
-    if not isinstance(estimate, PosteriorUtility | LinearProgramUtility):
-        return {"utility": to_tree(estimate)}
-    if isinstance(estimate, LinearProgramUtility):
-        variables: dict[str, Any] = {"weights": ("feature", estimate.weights)}
-        attributes: dict[str, Any] = {"discount": estimate.discount, "scale": estimate.scale}
-    else:
-        rows = {"weights": (("setting", "feature"), estimate.weights), "scales": ("setting", estimate.scales)}
-        variables = {"multiples": (("setting", "dimension"), estimate.multiples), **rows}
-        attributes = {"discount": estimate.discount}
-    functions = _function_group("features", estimate.features)
-    if not functions:
-        attributes["features"] = "other"  # the user's function, which has to be passed again
-    children = {"quality": to_tree(estimate.quality), **functions}
-    groups = {"utility": xr.DataTree(xr.Dataset(variables, attrs=attributes), children=children)}
-    if isinstance(estimate, PosteriorUtility):
+    try:
+        groups = {"utility": to_tree(estimate, without=("posterior",))}
+    except ValueError:  # φ is a function of the user's, which has to be passed again
+        groups = {"utility": to_tree(estimate, without=("posterior", "features"))}
+        groups["utility"].attrs["features"] = "other"
+    if estimate.posterior is not None:
         small = stored(estimate.posterior)
         groups |= {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
         groups["fit"] = xr.DataTree(small.to_dataset())
     return groups
 
 
-def _function_group(name: str, features: StateFeatures) -> dict[str, xr.DataTree]:
-    """φ as a group; none for a function of the user's."""
-    try:
-        return {name: to_tree(features)}
-    except ValueError:
-        return {}
-
-
 def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Sequence[type]) -> UtilityEstimate:
-    utility = tree.children["utility"]
-    if "class" in utility.attrs:
-        return from_tree(utility, known=known)
-    if "features" in utility.children:
-        features = from_tree(utility.children["features"], known=known)
-    if features is None:
-        raise ValueError("a run with features of the user's own: pass them again as features=")
-    data, discount, quality = utility.dataset, float(utility.attrs["discount"]), from_tree(utility.children["quality"])
-    if "fit" not in tree.children:
-        return LinearProgramUtility(features, data["weights"].values, discount, quality, float(utility.attrs["scale"]))
-    groups = {name: tree.children[name] for name in POSTERIOR_GROUPS if name in tree.children}
-    posterior = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
-    multiples, scales, weights = (data[name].values for name in ("multiples", "scales", "weights"))
-    return PosteriorUtility(features, multiples, scales, weights, discount, quality, posterior)
+    utility, given = tree.children["utility"], dict[str, Any]()
+    if "fit" in tree.children:
+        groups = {name: tree.children[name] for name in POSTERIOR_GROUPS if name in tree.children}
+        given["posterior"] = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
+    if utility.attrs.get("features") == "other":
+        if features is None:
+            raise ValueError("a run with features of the user's own: pass them again as features=")
+        given["features"] = features
+    if "class" not in utility.attrs:  # by an earlier version: the posterior's groups say which of two it is
+        numbers = {name: float(utility.attrs[name]) for name in ("discount", "scale") if name in utility.attrs}
+        kind = "posterior" if "posterior" in given else "linear-program"
+        utility.attrs |= {"class": kind, "fields": json.dumps(numbers)}
+    return from_tree(utility, known=known, given=given)

@@ -6,7 +6,7 @@ Nothing is pickled: a file holds arrays and numbers, for a class that `STORED` n
 
 import dataclasses
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import jax
@@ -15,7 +15,7 @@ import xarray as xr
 
 from bayespbrl.features import JointRadialBasis, OneHot, RadialBasis, StateActionProduct
 from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, TabularPolicy
-from bayespbrl.utility import FitQuality, KnownReward
+from bayespbrl.utility import FitQuality, KnownReward, LinearProgramUtility, PosteriorUtility
 
 # The names of our classes in files. A name never changes; the class may move to another module.
 STORED: dict[str, type] = {
@@ -24,7 +24,9 @@ STORED: dict[str, type] = {
     "joint-radial-basis": JointRadialBasis,
     "known-reward": KnownReward,
     "linear-gaussian": LinearGaussianPolicy,
+    "linear-program": LinearProgramUtility,
     "one-hot": OneHot,
+    "posterior": PosteriorUtility,
     "radial-basis": RadialBasis,
     "softmax": SoftmaxPolicy,
     "state-action-product": StateActionProduct,
@@ -34,8 +36,8 @@ NAMES = {kind: name for name, kind in STORED.items()}
 OWN = "own:"  # prefix of the name of a user's class
 
 
-def to_tree(instance: Any) -> xr.DataTree:
-    """The tree of a dataclass instance.
+def to_tree(instance: Any, *, without: Collection[str] = ()) -> xr.DataTree:
+    """The tree of a dataclass instance, `without` some of its fields.
 
     Raises:
       ValueError: not a dataclass instance; a field that is no array, number, text, tuple, None or dataclass.
@@ -43,30 +45,31 @@ def to_tree(instance: Any) -> xr.DataTree:
     if not dataclasses.is_dataclass(instance) or isinstance(instance, type):
         raise ValueError(f"stored class: expected an instance of a dataclass, got {type(instance).__name__}")
     arrays, plain, children = {}, {}, {}
-    for field in dataclasses.fields(instance):
-        value = getattr(instance, field.name)
+    for name in [field.name for field in dataclasses.fields(instance) if field.name not in without]:
+        value = getattr(instance, name)
         if isinstance(value, np.ndarray | jax.Array):
             array = np.asarray(value)
-            arrays[field.name] = ([f"{field.name}_{axis}" for axis in range(array.ndim)], array)
+            arrays[name] = ([f"{name}_{axis}" for axis in range(array.ndim)], array)
         elif dataclasses.is_dataclass(value):
-            children[field.name] = to_tree(value)
+            children[name] = to_tree(value)
         elif value is None or isinstance(value, bool | int | float | str | tuple | np.generic):
-            plain[field.name] = value.item() if isinstance(value, np.generic) else value
+            plain[name] = value.item() if isinstance(value, np.generic) else value
         else:
             raise ValueError(
-                f"stored class: expected an array, number or text in {type(instance).__name__}.{field.name}, "
+                f"stored class: expected an array, number or text in {type(instance).__name__}.{name}, "
                 f"got {type(value).__name__}"
             )
     attributes = {"class": stored_name(type(instance)), "fields": json.dumps(plain)}
     return xr.DataTree(xr.Dataset(arrays, attrs=attributes), children=children)
 
 
-def from_tree(tree: xr.DataTree, *, known: Iterable[type] = ()) -> Any:
+def from_tree(tree: xr.DataTree, *, known: Iterable[type] = (), given: Mapping[str, Any] | None = None) -> Any:
     """The dataclass instance of a tree that `to_tree` returned.
 
     Args:
       tree: loaded into memory.
       known: classes of the user's that the tree may name.
+      given: the fields that it was stored without.
 
     Raises:
       ValueError: a class that is neither ours nor in `known`, or fields that do not fit the class.
@@ -79,7 +82,7 @@ def from_tree(tree: xr.DataTree, *, known: Iterable[type] = ()) -> Any:
     arrays = {str(name): variable.values for name, variable in tree.data_vars.items()}
     children = {name: from_tree(child, known=known) for name, child in tree.children.items()}
     try:
-        return kind(**fields, **arrays, **children)
+        return kind(**fields, **arrays, **children, **(given or {}))
     except TypeError as error:
         raise ValueError(f"stored class: the fields do not fit {kind.__name__} ({error})") from error
 

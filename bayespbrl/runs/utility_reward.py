@@ -1,16 +1,13 @@
 """The inferred utility as the reward of an environment, for any library that learns from rewards."""
 
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
-import xarray as xr
 
 from bayespbrl import checks
 from bayespbrl.envs.opening import to_plain
 from bayespbrl.runs.run import Run
-from bayespbrl.utility.posterior_utility import PosteriorUtility, spacing
 
 DRAWS = 200  # for the standard deviation: known to a twentieth
 
@@ -34,9 +31,9 @@ class UtilityReward(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env, run: Run, *, caution: float = 0.0):
         super().__init__(env)
-        self.estimate = run.estimate
-        if self.estimate is None or not hasattr(self.estimate, "utilities"):
-            kind = "none yet" if self.estimate is None else type(self.estimate).__name__
+        estimate = run.estimate
+        if estimate is None or estimate.features is None:
+            kind = "none yet" if estimate is None else type(estimate).__name__
             raise ValueError(f"run: expected one with an estimate of the utility, got {kind}")
         given = run.learner.given
         for name in ("observation_space", "action_space"):
@@ -44,9 +41,10 @@ class UtilityReward(gymnasium.Wrapper):
                 raise ValueError(f"{name}: expected {getattr(given, name)}, the run's, got {getattr(env, name)}")
         checks.finite("caution", caution)
         self.caution = float(caution)
-        if self.caution and self.estimate.posterior is None:
+        if self.caution and estimate.posterior is None:
             raise ValueError("caution: expected 0 for an estimate without a posterior")
-        self._thinned = _thinned(self.estimate) if isinstance(self.estimate, PosteriorUtility) else None
+        # thinned once: where they are indexed the draws would be, at each step
+        self.estimate, self._thinned = estimate, estimate.thinned(DRAWS)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """As of the environment, with the utility as the reward."""
@@ -56,15 +54,7 @@ class UtilityReward(gymnasium.Wrapper):
         return observation, utility - self.caution * deviation, terminated, truncated, info
 
     def _utility(self, states: np.ndarray) -> tuple[float, float]:
-        if self._thinned is None:
-            return float(self.estimate.utilities(states)[0]), 0.0  # type: ignore[union-attr]
+        if self._thinned.posterior is None:
+            return float(self._thinned.utilities(states)[0]), 0.0
         mean, draws = self._thinned.utilities_and_draws(states)
         return float(mean[0]), float(draws[:, 0].std())
-
-
-def _thinned(estimate: PosteriorUtility) -> PosteriorUtility:
-    """The estimate with `DRAWS` of its draws, computed once: where they are indexed they would be, at each step."""
-    drawn = estimate.posterior["posterior"].dataset[["setting", "utility_weights"]]
-    apart = spacing(drawn["setting"].size, DRAWS)
-    few = drawn.isel(draw=slice(None, None, apart)).load()
-    return replace(estimate, posterior=xr.DataTree.from_dict({"posterior": few}))

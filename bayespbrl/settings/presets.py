@@ -12,6 +12,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 
 from bayespbrl import checks
+from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.experts import SIMULATED
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR
 
@@ -92,12 +93,7 @@ TASKS = {
     for task, check_episodes in (("gridworld", 40), ("swing-up", 8), ("bicycle", 8), ("acrobot", 40))
 }
 # An environment object of the user's is known by its gymnasium id.
-IDS = {
-    "bayespbrl/Gridworld-v0": "gridworld",
-    "bayespbrl/Bicycle-v0": "bicycle",
-    "bayespbrl/SwingUp-v0": "swing-up",
-    "bayespbrl/Acrobot-v0": "acrobot",
-}
+IDS = {identity: short for short, identity in SHORT_NAMES.items()}
 DEFAULT: dict[str, Any] = {
     "iterations": None,  # they follow from the answers
     "answers": 20,

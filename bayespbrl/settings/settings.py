@@ -13,15 +13,17 @@ from bayespbrl.experts import SIMULATED
 from bayespbrl.features import RadialBasisOptions
 from bayespbrl.improvement.problem import PolicyUpdate
 from bayespbrl.improvement.q_function import Critic
+from bayespbrl.improvement.schedules import SCHEDULES
 from bayespbrl.models import PreferenceModel
+from bayespbrl.policies.choice import POLICIES
 from bayespbrl.questions import Questions
 from bayespbrl.settings import presets
 from bayespbrl.settings.presets import Task, preset_options
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 
 LAST_ITERATIONS = 5  # after the last answer: the policy catches up with what is known
+INFERRED: dict[str, Any] = {"steepness": None, "lapse_rate": None}  # unless they or all hyperparameters are given
 MOST_UNASKED = 10  # in a row; then more answers would change little
-POLICIES = ("auto", "tabular", "softmax", "linear-gaussian", "gaussian-process", "other")
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,7 @@ class Features:
         checks.positive("bandwidth_factor", self.bandwidth_factor)
         checks.positive("utility_bandwidth_factor", self.utility_bandwidth_factor)
         for name in ("normalised_utility", "constant_utility"):
-            if not isinstance(value := getattr(self, name), bool):
-                raise ValueError(f"{name}: expected true or false, got {value!r}")
+            checks.boolean(name, getattr(self, name))
 
     @property
     def of_critic(self) -> RadialBasisOptions:
@@ -97,12 +98,10 @@ class Rollouts:
 
     def __post_init__(self) -> None:
         checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
-        if self.max_steps is not None:
-            checks.whole("max_steps", self.max_steps)
-        if self.exploration_hold is not None:
-            checks.whole("exploration_hold", self.exploration_hold)
+        checks.optional(checks.whole, "max_steps", self.max_steps)
+        checks.optional(checks.whole, "exploration_hold", self.exploration_hold)
         checks.whole("evaluation_episodes", self.evaluation_episodes)
-        checks.one_of("policy", self.policy, POLICIES)
+        checks.one_of("policy", self.policy, ("auto", *POLICIES, "other"))
         checks.positive("initial_action_scale", self.initial_action_scale)
 
 
@@ -128,7 +127,7 @@ class Settings:
     environment: str = "named"
     expert: str = "return"
     wrong_answers: float = 0.0
-    model: PreferenceModel = field(default_factory=partial(PreferenceModel, steepness=None, lapse_rate=None))
+    model: PreferenceModel = field(default_factory=partial(PreferenceModel, **INFERRED))
     estimation: Estimation = field(default_factory=Estimation)
     features: Features = field(default_factory=Features)
     critic: Critic = field(default_factory=Critic)
@@ -151,6 +150,7 @@ class Settings:
     def _check_together(self) -> None:
         """What one part's option asks of another part's."""
         utility, query, schedule = self.estimation.utility, self.questions.query, self.update.schedule
+        checks.one_of("schedule", schedule, (*SCHEDULES, "other"))
         if utility in WITHOUT_POSTERIOR and query not in ("highest-utility", "other"):
             raise ValueError(f"query: expected highest-utility with {utility}, no posterior, got {query!r}")
         if self.estimation.plain_draws is not None and None in (self.model.steepness, self.model.lapse_rate):
@@ -176,7 +176,7 @@ class Settings:
         for name, value in options.items():
             parts[OPTIONS[name]][name] = value
         if parts["estimation"].get("hyperparameters", Estimation.hyperparameters) == "inferred":
-            parts["model"] = {"steepness": None, "lapse_rate": None} | parts["model"]
+            parts["model"] = INFERRED | parts["model"]
         own = parts.pop("")
         return cls(env, **own, **{name: PARTS[name](**chosen) for name, chosen in parts.items()})
 
@@ -187,13 +187,11 @@ class Settings:
     @property
     def most_iterations(self) -> int:
         """The limit that holds: `iterations`, else three for every two answers, and the last ones."""
-        budget = self.questions.answers
-        if self.iterations is None:
-            assert budget is not None
-            if self._restarted:
-                return max(3 * budget // 2, LAST_ITERATIONS) + self._restarted
-            return 3 * budget // 2 + LAST_ITERATIONS
-        return self.iterations
+        if self.iterations is not None:
+            return self.iterations
+        assert self.questions.answers is not None
+        most = 3 * self.questions.answers // 2
+        return max(most, LAST_ITERATIONS) + self._restarted if self._restarted else most + LAST_ITERATIONS
 
     @property
     def _restarted(self) -> int:

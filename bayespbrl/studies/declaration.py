@@ -169,18 +169,12 @@ def _axis(where: str, axis: str, content: Mapping[str, Any]) -> dict[str, Option
         own = OF_A_LEVEL.get(axis, ())
         _options(place, {name: value for name, value in _table(place, options).items() if name not in own})
         for name in {"minutes", "failed_below"} & set(options):
-            checks.finite(f"{place}, {name}", _number(f"{place}, {name}", options[name]))
+            checks.number(f"{place}, {name}", options[name])
         if not isinstance(options.get("env", ""), str) or not isinstance(options.get("untrained", False), bool):
             raise ValueError(f"{place}: expected env as text and untrained as true or false, got {dict(options)}")
         if "baseline" in options:
             checks.one_of(f"{place}, baseline", options["baseline"], tuple(BASELINES))
     return dict(levels) or {"": {}}
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name}: expected a number, got {value!r}")
-    return float(value)
 
 
 def _table(where: str, value: Any) -> dict[str, Any]:

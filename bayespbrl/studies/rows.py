@@ -1,7 +1,7 @@
 """One row of a study: a task with one choice of options, its trials, and which seeds they have."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,10 @@ from bayespbrl.runs.simulated import SIMULATED, expert_of
 from bayespbrl.settings import Settings, settings_for
 from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
+    BALANCING_FILE,
+    FIRST_POLICY_FILE,
     collect,
     collect_first_policies,
-    has_balancing,
-    has_first_policy,
     measure_balancing,
     measure_first_policy,
 )
@@ -74,19 +74,17 @@ class Row:
         kept = RunDirectory.open(path)
         if kept.settings != replace(self.settings, seed=seed):
             raise ValueError(f"{path}: expected a trial with these settings, got others: {kept.settings}")
-        if self.untrained:
-            return True if has_first_policy(path) else None
-        if self.baseline is not None:
-            return True if (path / BASELINE_FILE).exists() else None
-        if (path / "summary.json").exists() and self.redraws(read_summary(path)["iterations"]):
+        if self.untrained or self.baseline is not None:
+            return True if (path / (FIRST_POLICY_FILE if self.untrained else BASELINE_FILE)).exists() else None
+        done = read_summary(path)["iterations"] if (path / "summary.json").exists() else []
+        if done and self.redraws(len(done), done[-1]["pairs"]):
             return False
-        measured = self.balancing_steps is None or has_balancing(path)
+        measured = self.balancing_steps is None or (path / BALANCING_FILE).exists()
         return True if measured and kept.finished() else None
 
-    def redraws(self, summaries: Sequence[Mapping[str, Any]]) -> bool:
-        """Whether a trial with these summaries met no preference within the iterations that it has for that."""
-        within = self.preference_within
-        return within is not None and len(summaries) >= within and summaries[within - 1]["pairs"] == 0
+    def redraws(self, iterations: int, pairs: int) -> bool:
+        """Whether a trial with so many ordered pairs met no preference within the iterations that it has for that."""
+        return self.preference_within is not None and iterations >= self.preference_within and pairs == 0
 
 
 def row_of(
@@ -106,8 +104,7 @@ def row_of(
     """
     if directory.exists() and not directory.is_dir():
         raise ValueError(f"{directory}: expected a directory for the trials, got a file")
-    if preference_within is not None:
-        checks.whole("preference_within", preference_within)
+    checks.optional(checks.whole, "preference_within", preference_within)
     environment = open_environment(env)
     identity = environment_name(environment)
     first = settings_for(env, task=task_of(environment, options.get("max_steps")), **options, seed=seed)
@@ -170,13 +167,17 @@ def run_trial(row: Row, seed: int) -> bool:
 
 def _trained(row: Row, learner: Learner, path: Path) -> bool:
     expert = expert_of(learner)
-    while not row.redraws(learner.state.summaries) and (questions := learner.ask()):
+    while not (redraws := _redraws(row, learner)) and (questions := learner.ask()):
         learner.tell([expert(*query.trajectories) for query in questions])
-    if row.redraws(learner.state.summaries):
+    if redraws:
         return False
     if row.balancing_steps is not None:
         measure_balancing(learner, path, max_steps=row.balancing_steps)
     return True
+
+
+def _redraws(row: Row, learner: Learner) -> bool:
+    return row.redraws(learner.state.iteration, len(learner.preferences.pairs))
 
 
 def seconds_of(directory: Path) -> float | None:

@@ -23,7 +23,7 @@ from typing import Any
 import pandas as pd
 
 from bayespbrl import checks
-from bayespbrl.runs.files import write_file, written_aside
+from bayespbrl.runs.files import write_file
 from bayespbrl.studies.declaration import AXES, Declaration, parsed
 from bayespbrl.studies.engine import Engine, Failure, Progress
 from bayespbrl.studies.rows import Seeds, collected, row_of, seconds_of
@@ -168,8 +168,8 @@ class Study:
             if seeds.with_outcome(True)
         ]
         if tables:
-            with written_aside(self.directory / "iterations.csv") as aside:
-                pd.concat(tables).to_csv(aside, index=False, lineterminator="\n", float_format="%.6g")
+            text = pd.concat(tables).to_csv(index=False, lineterminator="\n", float_format="%.6g")
+            write_file(self.directory / "iterations.csv", text)
 
 
 def _table_of(levels: tuple[str, ...], seeds: Seeds) -> pd.DataFrame:

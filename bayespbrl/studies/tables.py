@@ -13,7 +13,7 @@ from bayespbrl import rollouts
 from bayespbrl.envs import bicycle
 from bayespbrl.learner import Learner
 from bayespbrl.runs.directory import read_complete_summary
-from bayespbrl.runs.files import write_file, write_netcdf, written_aside
+from bayespbrl.runs.files import write_file, write_netcdf
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value", "value_newest")
 
@@ -42,7 +42,7 @@ def collect(
         values = [[entry.get(name) for entry in row] for row in rows]
         if name not in {"iteration", *nested} and (figures := _figures(values)) is not None:
             variables[name] = (("seed", "iteration", f"{name}_dimension")[: figures.ndim], figures)
-    if all(has_balancing(path) for path in directories):
+    if all((Path(path) / BALANCING_FILE).exists() for path in directories):
         lasted = [json.loads((Path(path) / BALANCING_FILE).read_text()) for path in directories]
         limits = {name: lasted[0][name] for name in ("max_steps", "episodes")}
         variables["balancing_steps"] = ("seed", np.array([entry["mean_steps"] for entry in lasted]), limits)
@@ -89,11 +89,6 @@ def _figures(values: Sequence[Sequence[Any]]) -> np.ndarray | None:
     return np.array([[missing if value is None else value for value in row] for row in values])
 
 
-def has_balancing(directory: Path | str) -> bool:
-    """Whether `measure_balancing` has written its file into a run directory."""
-    return (Path(directory) / BALANCING_FILE).exists()
-
-
 def measure_balancing(learner: Learner, directory: Path, *, max_steps: int, episodes: int = 100) -> None:
     """Measure the steps of a learner's final policy before a terminal state, over fresh episodes; in `balancing.json`.
 
@@ -108,11 +103,6 @@ def measure_balancing(learner: Learner, directory: Path, *, max_steps: int, epis
         "terminated": float(lasted.terminated.mean()),
     }
     write_file(directory / BALANCING_FILE, json.dumps(content, indent=1) + "\n")
-
-
-def has_first_policy(directory: Path | str) -> bool:
-    """Whether `measure_first_policy` has written its file into a run directory."""
-    return (Path(directory) / FIRST_POLICY_FILE).exists()
 
 
 def measure_first_policy(learner: Learner, directory: Path) -> None:
@@ -146,6 +136,5 @@ def write_tables(table: xr.Dataset, directory: Path) -> None:
         rows["survival"] = [f"{share:g}" for share in (1 - table["terminated"]).values.ravel()]
         rows["balancing_steps"] = steps.where(last)
         rows["balancing_seconds"] = [round(number * bicycle.STEP_SECONDS, 6) for number in rows["balancing_steps"]]
-    with written_aside(directory / "trials.csv") as aside:
-        rows.to_csv(aside, index=False, lineterminator="\r\n")
+    write_file(directory / "trials.csv", rows.to_csv(index=False, lineterminator="\r\n"))
     write_netcdf(directory / "trials.nc", table)

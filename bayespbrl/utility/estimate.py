@@ -1,12 +1,13 @@
 """What the other steps ask of a utility estimate: the protocol of its kinds."""
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn, Protocol, Self
 
 import numpy as np
 from jaxtyping import Float
 from xarray import DataTree
 
+from bayespbrl.features import StateFeatures
 from bayespbrl.models.likelihoods import Likelihood
 from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.quality import FitQuality
@@ -15,8 +16,8 @@ from bayespbrl.utility.quality import FitQuality
 class UtilityEstimate(Protocol):
     """An estimate of the expert's utility: a point, or a posterior with draws.
 
-    `posterior` says which. Where it is None the methods that need one (`likelihood`, `trajectory_draws`,
-    `margin_draws`, `utilities_and_draws`) raise a ValueError.
+    `posterior` says which. Where it is None the methods that need one (those below `likelihood`) raise a ValueError.
+    `features` says whether it is a utility of states; where it is None, `utilities` raises a ValueError.
     """
 
     @property
@@ -29,8 +30,18 @@ class UtilityEstimate(Protocol):
         """The draws whose convergence `quality` reports and which all else is of; None for a point estimate."""
         ...
 
-    def likelihood(self, number: int | None = None) -> Likelihood:
-        """Of the next answer given its margin under each of S draws, at most `number`: margins have shape (S, n)."""
+    @property
+    def features(self) -> StateFeatures | None:
+        """φ of a utility of states; None for another."""
+        ...
+
+    @property
+    def number_of_features(self) -> int:
+        """D; 0 without `features`."""
+        ...
+
+    def thinned(self, number: int) -> Self:
+        """The same with at most `number` draws, in memory; itself where there are none."""
         ...
 
     def hyperparameters(self) -> dict[str, Any] | None:
@@ -41,14 +52,34 @@ class UtilityEstimate(Protocol):
         """uᵢ of each transition."""
         ...
 
-    def utilities_and_draws(
-        self, states: np.ndarray, *, number: int | None = None
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
-        """Expected utility of n states and S posterior draws of it, at most `number`, in one pass over the features."""
+    def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
+        """The utility wᵀφ(s) of n states."""
         ...
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
-        """Expected utility wᵀψ(τ) of each trajectory."""
+        """The utility wᵀψ(τ) of each trajectory."""
+        ...
+
+    def likelihood(self, number: int | None = None) -> Likelihood:
+        """Of the next answer given its margin under each of S draws, at most `number`: margins have shape (S, n)."""
+        ...
+
+    def tie_thresholds(self, number: int | None = None) -> Float[np.ndarray, "s 1"] | None:
+        """The tie threshold of each of these draws; None where no answer was a tie."""
+        ...
+
+    def utilities_and_draws(
+        self, states: np.ndarray, *, number: int | None = None
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
+        """`utilities` of n states and S posterior draws of them, at most `number`, in one pass over the features."""
+        ...
+
+    def mean_utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
+        """The posterior mean of the utility of n states, whichever utility is acted on."""
+        ...
+
+    def prior_deviations(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
+        """Prior standard deviation of the utility of n states."""
         ...
 
     def trajectory_draws(
@@ -57,34 +88,35 @@ class UtilityEstimate(Protocol):
         """S posterior draws of the utility wᵀψ(τ) of each trajectory, at most `number`."""
         ...
 
-    def margin_draws(self, first: Trajectory, second: Trajectory) -> Float[np.ndarray, " s"]:
-        """By how much each draw prefers the first."""
+    def differences(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, "c n d"]:
+        """ψ(first) − ψ of each trajectory under each of C settings, in the units of the posterior's differences."""
         ...
+
+
+def refused(asked: str, needed: str = "an estimate with a posterior") -> Callable[..., Any]:
+    """The method of that name of an estimate without what it needs: a ValueError."""
+
+    def method(self: object, *arguments: Any, **options: Any) -> NoReturn:
+        raise ValueError(f"{asked}: expected {needed}, got {type(self).__name__}")
+
+    return method
 
 
 class WithoutDraws:
     """The part of the protocol that a point estimate lacks."""
 
     posterior = None
+    likelihood = refused("likelihood")
+    tie_thresholds = refused("tie_thresholds")
+    utilities_and_draws = refused("utilities_and_draws")
+    mean_utilities = refused("mean_utilities")
+    prior_deviations = refused("prior_deviations")
+    trajectory_draws = refused("trajectory_draws")
+    differences = refused("differences")
+
+    def thinned(self, number: int) -> Self:
+        """Itself: there are no draws."""
+        return self
 
     def hyperparameters(self) -> None:
         """None: nothing."""
-
-    def likelihood(self, number: int | None = None) -> Likelihood:
-        """None: a ValueError."""
-        raise self._no_posterior("likelihood")
-
-    def utilities_and_draws(self, states: np.ndarray, *, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """None: a ValueError."""
-        raise self._no_posterior("utilities_and_draws")
-
-    def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
-        """None: a ValueError."""
-        raise self._no_posterior("trajectory_draws")
-
-    def margin_draws(self, first: Trajectory, second: Trajectory) -> np.ndarray:
-        """None: a ValueError."""
-        raise self._no_posterior("margin_draws")
-
-    def _no_posterior(self, asked: str) -> ValueError:
-        return ValueError(f"{asked}: expected an estimate with a posterior, got {type(self).__name__} without")

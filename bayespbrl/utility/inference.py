@@ -11,6 +11,7 @@ from bayespbrl import checks
 from bayespbrl.features import StateFeatures
 from bayespbrl.models import Answers, PreferenceModel, linear_program, plain_chain, plain_draws, posterior_draws
 from bayespbrl.models.posterior_tree import bases_of
+from bayespbrl.trajectories import DISCOUNT
 from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.length_scales import settings, sums_under
@@ -45,8 +46,7 @@ class Estimation:
     def __post_init__(self) -> None:
         checks.one_of("utility", self.utility, METHODS)
         checks.one_of("hyperparameters", self.hyperparameters, ("inferred", "given"))
-        if self.trajectory_discount is not None:
-            checks.share("trajectory_discount", self.trajectory_discount)
+        checks.optional(checks.share, "trajectory_discount", self.trajectory_discount)
         if self.plain_draws is not None:
             checks.whole("plain_draws", self.plain_draws, plain_chain.LEAST)
             if self.hyperparameters != "given":
@@ -90,7 +90,7 @@ def infer_utility(
     answerers: ArrayLike | None = None,
     features: StateFeatures | None = None,
     method: str = "posterior-mean",
-    discount: float = 0.98,
+    discount: float = DISCOUNT,
     prior_scale: float = PreferenceModel.prior_scale,
     steepness: float | None = None,
     lapse_rate: float | None = None,

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from bayespbrl.features import StateFeatures, linear
 from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
-from bayespbrl.utility.estimate import WithoutDraws
+from bayespbrl.utility.estimate import WithoutDraws, refused
 from bayespbrl.utility.quality import FitQuality
 
 
@@ -30,6 +30,11 @@ class LinearProgramUtility(WithoutDraws):
     quality: FitQuality
     scale: float = 1.0
 
+    @property
+    def number_of_features(self) -> int:
+        """D."""
+        return len(self.weights)
+
     def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
         """wᵀφ(s) of n states."""
         return linear(self.features(states), self.weights)
@@ -48,6 +53,9 @@ class KnownReward(WithoutDraws):
     """The environment's own reward in place of an estimate: a reference run trained on the hidden reward."""
 
     quality: FitQuality
+    features = None
+    number_of_features = 0
+    utilities = refused("utilities", "a utility of states")
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
         """The hidden reward of each transition."""

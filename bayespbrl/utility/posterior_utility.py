@@ -1,8 +1,8 @@
 """The posterior of the utility over everything that is unknown, and the utility that is acted on (paper, eqs. 7-8)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -46,6 +46,17 @@ class PosteriorUtility:
     quality: FitQuality
     posterior: DataTree
 
+    @property
+    def number_of_features(self) -> int:
+        """D."""
+        return int(self.weights.shape[-1])
+
+    def thinned(self, number: int) -> Self:
+        """The same with at most `number` draws, in memory; no more than `utilities_and_draws` needs is kept."""
+        drawn = self.posterior["posterior"].dataset[["setting", "utility_weights"]]
+        few = drawn.isel(draw=slice(None, None, spacing(drawn["setting"].size, number))).load()
+        return replace(self, posterior=DataTree.from_dict({"posterior": few}))
+
     def likelihood(self, number: int | None = None) -> Likelihood:
         """Of the next answer given its margin under each of S draws: margins have shape (S, n).
 
@@ -75,6 +86,11 @@ class PosteriorUtility:
         """The utility of n states."""
         return self._drawn(self._of_states(states), None)[0]
 
+    def mean_utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
+        """The posterior mean of the utility of n states, whichever utility is acted on."""
+        parts = np.atleast_2d(self.posterior["utility_weights_mean"]) / self.scales[:, None]
+        return replace(self, weights=parts).utilities(states)
+
     def prior_deviations(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
         """Prior standard deviation of the utility of n states."""
         settings = [self._setting(number)(states) / scale for number, scale in enumerate(self.scales)]
@@ -100,11 +116,6 @@ class PosteriorUtility:
     ) -> Float[np.ndarray, "s n"]:
         """Posterior draws of wᵀψ(τ) of each trajectory, the chains one after the other."""
         return self._drawn(self._of_trajectories(trajectories), self._apart(number))[1]
-
-    def margin_draws(self, first: Trajectory, second: Trajectory) -> Float[np.ndarray, " s"]:
-        """By how much each draw prefers the first."""
-        draws = self.trajectory_draws([first, second])
-        return draws[:, 0] - draws[:, 1]
 
     def differences(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, "c n d"]:
         """ψ(first) − ψ of each trajectory under every setting, in the units of the posterior's differences."""

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from gymnasium.experimental.functional import FuncEnv
 
-from bayespbrl.diagnostics.estimates import first_preferred_probability, number_of_features, of_states
+from bayespbrl.diagnostics.estimates import first_preferred_probability
 from bayespbrl.diagnostics.predictions import fitted_model
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
@@ -174,7 +174,7 @@ def _with_iteration(contents: RunContents, iteration: int, file: Path, features:
         contents = replace(contents, answers=tuple(answers))
     if "estimate" in parts:
         contents = replace(contents, estimate=parts["estimate"], estimate_iteration=iteration)
-        missing = contents.features_missing or _features_failure(contents.estimate, features, parts["trajectories"][0])
+        missing = contents.features_missing or _features_failure(parts["estimate"], features, parts["trajectories"][0])
         contents = replace(contents, features_missing=missing)
     return contents
 
@@ -217,15 +217,15 @@ def _check_fitting(contents: RunContents, parts: Mapping[str, Any], features: St
         raise ValueError(f"the estimate fails ({type(error).__name__}: {' '.join(str(error).split())})") from error
 
 
-def _features_failure(estimate: Any, features: StateFeatures | None, trajectory: Trajectory) -> str:
+def _features_failure(estimate: UtilityEstimate, features: StateFeatures | None, trajectory: Trajectory) -> str:
     """What is wrong with features that were passed; empty if nothing."""
-    if features is None or not of_states(estimate):
+    if features is None or estimate.features is None:
         return ""
     try:
         width = checked_features(features, trajectory.states).shape[1]
     except Exception as error:  # a function of the user's may raise anything
         return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
-    expected = number_of_features(estimate)
+    expected = estimate.number_of_features
     return "" if width == expected else f"the one that was passed has {width} features, the run's {expected}"
 
 

@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
+from bayespbrl.figures import new_figure, png
+
 
 @dataclass(frozen=True)
 class ReportWarning:
@@ -107,26 +109,24 @@ def drawn(
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
     layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08, wspace=0.05, hspace=0.05)
-    figure = Figure(figsize=(columns * size[0], rows * size[1]), layout=layout)
+    figure = new_figure(columns * size[0], rows * size[1], layout=layout)
     grid = np.ravel(figure.subplots(rows, columns, squeeze=False))
     for axes, (title, draw) in zip(grid, panels, strict=False):
         draw(axes)
         axes.set_title(title, fontsize=10)
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
-    return Picture(name, _png(figure, dpi=150, colours=256), caption, alt, columns * size[0])
+    return Picture(name, _few_colours(figure, dpi=150, colours=256), caption, alt, columns * size[0])
 
 
 def thumbnail(name: str, draw: Callable[[Axes], object], caption: str, alt: str) -> Picture:
     """A small picture of what `draw` draws, in 64 colours and a few kilobytes."""
-    figure = Figure(figsize=(4.4, 3.4))
+    figure = new_figure(4.4, 3.4, layout=None)
     draw(figure.subplots())
-    return Picture(name, _png(figure, dpi=85, colours=64, bbox_inches="tight", pad_inches=0.03), caption, alt)
+    return Picture(name, _few_colours(figure, dpi=85, colours=64, bbox_inches="tight", pad_inches=0.03), caption, alt)
 
 
-def _png(figure: Figure, *, dpi: int, colours: int, **options: Any) -> bytes:
-    full, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(full, format="png", dpi=dpi, **options)
-    image = Image.open(full).convert("RGB")
+def _few_colours(figure: Figure, *, dpi: int, colours: int, **options: Any) -> bytes:
+    small, image = io.BytesIO(), Image.open(io.BytesIO(png(figure, dpi=dpi, **options))).convert("RGB")
     image.quantize(colours, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
     return small.getvalue()

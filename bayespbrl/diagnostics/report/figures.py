@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from bayespbrl.diagnostics.axes import finished, number_cells
+from bayespbrl.models.convergence import RHAT_LIMIT, SIZE_LIMIT
 
 MAIN, ACCENT = "#1b6ca8", "#c2571a"
 
@@ -36,7 +37,7 @@ def plot_progress(table: xr.Dataset, axes: Axes) -> Axes:
     return finished(axes, xlabel="iteration", ylabel="utility relative to the last")
 
 
-def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = 1.01) -> Axes:
+def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = RHAT_LIMIT) -> Axes:
     """Largest R̂ of each iteration's fit."""
     _series(table, axes, {"rhat_max": "largest R̂"}, converged="utility_converged")
     axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")
@@ -44,7 +45,7 @@ def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = 1.01) -> Axes:
     return finished(axes, ylabel="R̂", ylim=(min(low, 0.9995), max(high, limit + 0.002)))
 
 
-def plot_effective_sample_size(table: xr.Dataset, axes: Axes, *, limit: float = 400.0) -> Axes:
+def plot_effective_sample_size(table: xr.Dataset, axes: Axes, *, limit: float = SIZE_LIMIT) -> Axes:
     """Effective sample size of the worst margin of each iteration's fit."""
     _series(table, axes, {"effective_sample_size_min": "worst margin"}, converged="utility_converged")
     axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")

@@ -7,7 +7,6 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl.diagnostics.chains import convergence, plot_convergence, plot_ranks
-from bayespbrl.diagnostics.estimates import of_states
 from bayespbrl.diagnostics.power_scaling import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.predictive_checks import predictive_checks
 from bayespbrl.diagnostics.prequential import plot_calibration
@@ -52,7 +51,8 @@ def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
     first, last = float(iterations["value"][0]), float(iterations["value"][-1])
     alt = f"Learning curve: value from {number(first)} to {number(last)} over {int(iterations['answers'][-1])} answers."
     blocks = [drawn("learning", panels, caption, alt, size=(7.6, 3.3))]
-    if of_states(contents.estimate) and not contents.features_missing:
+    estimate = contents.estimate
+    if estimate is not None and estimate.features is not None and not contents.features_missing:
         curve = [("By the inferred utility", partial(figures.plot_progress, progress_table(contents)))]
         caption = (
             "Mean utility of each iteration's trajectories by the last estimate, relative to the last iteration's; the "

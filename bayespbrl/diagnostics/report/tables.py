@@ -1,21 +1,19 @@
 """The tables of a report, each an xarray data set: iterations, answers, the utility of states, trajectories."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from gymnasium.spaces import Discrete
 
-from bayespbrl.diagnostics.estimates import expect_estimate, of_states
+from bayespbrl.diagnostics.estimates import expect_estimate
 from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary
 from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws
 from bayespbrl.preferences import Answer
 from bayespbrl.trajectories import Trajectory
-from bayespbrl.utility import PosteriorUtility
 
 MEASURED = (
     *("answers", "pairs", "pairs_satisfied", "value", "kl_bound", "bound_active", "kl", "kl_fitted_policy", "updates"),
@@ -122,7 +120,7 @@ def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
     estimate = contents.estimate
     if not contents.trajectories:
         raise ValueError("trajectories: expected at least one that can be read, got none")
-    if not of_states(estimate):
+    if estimate is None or estimate.features is None:
         raise ValueError("utility: expected an estimate of the utility of states, got none")
     states = np.concatenate([trajectory.states for trajectory in contents.trajectories.values()])
     shown, attrs = _states_to_show(contents, states, np.random.default_rng(seed))
@@ -132,11 +130,10 @@ def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
     data["states"] = (("state",) if shown.ndim == 1 else ("state", "observation"), shown)
     if states.ndim == 1:
         data["visits"] = ("state", np.bincount(states, minlength=len(shown)))
-    if isinstance(estimate, PosteriorUtility):
+    if estimate.posterior is not None:
         _, draws = estimate.utilities_and_draws(shown, number=DRAWS)
         chosen = np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)
-        parts = np.atleast_2d(estimate.posterior["utility_weights_mean"]) / estimate.scales[:, None]
-        data["mean"] = ("state", replace(estimate, weights=parts).utilities(shown))
+        data["mean"] = ("state", estimate.mean_utilities(shown))
         data["sd"] = ("state", draws.std(axis=0))
         data["draws"] = (("draw", "state"), draws[chosen])
         data["prior_sd"] = ("state", estimate.prior_deviations(shown))

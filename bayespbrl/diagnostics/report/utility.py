@@ -1,19 +1,18 @@
 """The section of a report on the utility: over the states with its uncertainty, and of the compared trajectories."""
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from bayespbrl.diagnostics.estimates import of_states
 from bayespbrl.diagnostics.report import figures
 from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.document import Block, Body, Picture, drawn
 from bayespbrl.diagnostics.report.formatting import number, percent
 from bayespbrl.diagnostics.report.tables import trajectories_table, utility_table
 from bayespbrl.diagnostics.uncertainty import plot_ranking
-from bayespbrl.utility import PosteriorUtility
 
 PLACES = {
     "grid": "over the cells of the grid",
@@ -33,9 +32,9 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
         return [f"The features φ are a function of your own, and {contents.features_missing}."], []
     blocks: list[Block] = []
     text = [] if contents.posterior is not None else [contents.posterior_missing]
-    if isinstance(estimate, PosteriorUtility):
-        text.append(_what_else(estimate))
-    if of_states(estimate):
+    if contents.posterior is not None:
+        text.append(_what_else(estimate.hyperparameters() or {}, len(contents.posterior["utility_weights_mean"])))
+    if estimate.features is not None:
         table = utility_table(contents)
         blocks += _maps(table)
         text += _remaining_uncertainty(table)
@@ -53,9 +52,8 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
     return text, blocks
 
 
-def _what_else(estimate: PosteriorUtility) -> str:
-    """What the posterior says of all but the weights, in words."""
-    found = estimate.hyperparameters()
+def _what_else(found: Mapping[str, Any], settings: int) -> str:
+    """What the posterior over `settings` choices of length scales says of all but the weights, in words."""
 
     def inferred(name: str) -> str:
         low, high = (found[f"{name} {end}"] for end in ("lower", "upper"))
@@ -65,11 +63,11 @@ def _what_else(estimate: PosteriorUtility) -> str:
     for name, label in (("tie_threshold", "tie threshold"), ("side_bias", "side bias")):
         text += f", {label}: {inferred(name)}" if name in found else ""
     text += ", with 90 % intervals where they are inferred."
-    if len(estimate.scales) > 1:
+    if settings > 1:
         text += (
-            f" The posterior is over {len(estimate.scales)} choices of length scales as well; the most probable has "
+            f" The posterior is over {settings} choices of length scales as well; the most probable has "
             f"probability {percent(found['most probable length scales'])}, a priori "
-            f"{percent(1 / len(estimate.scales))}."
+            f"{percent(1 / settings)}."
         )
     return text
 
