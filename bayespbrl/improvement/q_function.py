@@ -66,7 +66,7 @@ class QFunction:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class CriticData:
     """What Q is estimated from.
 
     Attributes:
@@ -83,7 +83,7 @@ class Evidence:
 
 def estimate_q(
     policy: Any,
-    data: "Evidence",
+    data: CriticData,
     *,
     key: jax.Array,
     action_space: Space[Any],
@@ -120,7 +120,7 @@ def halvings(parts: Sequence[Any]) -> list[tuple[list[Any], list[Any]]]:
 
 
 def _sums(
-    policy: Any, data: Evidence, following: np.ndarray | None, features: StateActionFeatures, rows: np.ndarray
+    policy: Any, data: CriticData, following: np.ndarray | None, features: StateActionFeatures, rows: np.ndarray
 ) -> TransitionSums:
     """LSTD's sums over some of the transitions."""
     chosen = Transitions(*(column[rows] for column in vars(data.steps).values()))

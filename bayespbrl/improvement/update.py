@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from bayespbrl import checks
 from bayespbrl.improvement.problem import UpdateProblem
-from bayespbrl.improvement.q_function import Evidence, QFunction, estimate_q
+from bayespbrl.improvement.q_function import CriticData, QFunction, estimate_q
 from bayespbrl.improvement.reps import (
     RepsSolution,
     WhitenedFeatures,
@@ -171,7 +171,7 @@ def propose(
     next_key, fresh_key = jax.random.split(key)
     q_functions = estimate_q(
         policy,
-        Evidence(problem.steps, columns, problem.quarters),
+        CriticData(problem.steps, columns, problem.quarters),
         key=next_key,
         action_space=problem.action_space,
         features=problem.state_action_features,
