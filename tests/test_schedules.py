@@ -22,7 +22,7 @@ def proposed(draws=None, seed=0):
 def update_of(q_values, constraint, draws):
     """A proposed update as far as a schedule looks at it."""
     weights = np.full(len(q_values), 1 / len(q_values))
-    return ProposedUpdate(None, None, None, (), q_values, constraint, weights, draws)
+    return ProposedUpdate(None, None, None, (q_values, q_values), q_values, constraint, weights, draws)
 
 
 def situation(update, *, converged=True, usual=0.35):

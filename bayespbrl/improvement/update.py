@@ -10,7 +10,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jax import Array
+from jaxtyping import Float, Int, Key, Shaped
 
 from bayespbrl import checks
 from bayespbrl.improvement.problem import UpdateProblem
@@ -49,7 +50,7 @@ class ProposedUpdate:
     policy: Any
     problem: UpdateProblem
     q_functions: QFunction
-    samples: tuple[np.ndarray, np.ndarray]
+    samples: tuple[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, "n ..."]]
     q_values: Float[np.ndarray, " n"]
     state_features: Float[np.ndarray, "n d"] | Int[np.ndarray, " n"]
     base_weights: Float[np.ndarray, " n"]
@@ -58,7 +59,7 @@ class ProposedUpdate:
     solved: dict[float, RepsSolution] = field(default_factory=dict, repr=False)
 
     @cached_property
-    def constraint(self) -> WhitenedFeatures | np.ndarray:
+    def constraint(self) -> WhitenedFeatures | Int[np.ndarray, " n"]:
         """The whitened features, which every bound shares; or the states' numbers."""
         if self.state_features.ndim == 1:
             return self.state_features
@@ -154,7 +155,11 @@ class Improvement:
 
 
 def propose(
-    policy: Any, problem: UpdateProblem, *, key: jax.Array, utility_draws: Float[np.ndarray, "n s"] | None = None
+    policy: Any,
+    problem: UpdateProblem,
+    *,
+    key: Key[Array, ""],
+    utility_draws: Float[np.ndarray, "n s"] | None = None,
 ) -> ProposedUpdate:
     """Q under `policy`, and the samples whose weights an update would change.
 
@@ -204,7 +209,7 @@ def propose(
 
 
 def apply_update(
-    proposed: ProposedUpdate, kl_bound: float, *, key: jax.Array, rng: np.random.Generator, updates: int = 1
+    proposed: ProposedUpdate, kl_bound: float, *, key: Key[Array, ""], rng: np.random.Generator, updates: int = 1
 ) -> Improvement:
     """The policy after the proposed update at this bound, and further ones while they have something to gain.
 
@@ -244,8 +249,8 @@ def apply_update(
 
 
 def _all_actions(
-    policy: Any, states: np.ndarray, visits: Float[np.ndarray, " n"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    policy: Any, states: Shaped[np.ndarray, "v ..."], visits: Float[np.ndarray, " v"]
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Every action of every visited state, weighted by q(a|s) × visits; actions that q excludes are left out."""
     weights = policy.probabilities(states) * visits[:, None]
     rows, actions = np.nonzero(weights)

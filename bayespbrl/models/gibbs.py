@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray, Shaped
 
 from bayespbrl.models.likelihoods import Likelihood, Margins, Scalar, Values, WithLapses, WithTies, has_steps, log_prob
 from bayespbrl.models.preference_problem import PreferenceProblem
@@ -102,7 +102,7 @@ def conditional(problem: JointProblem, unknowns: Unknowns) -> PreferenceProblem:
     settings = problem.settings
     stacks = {name: getattr(settings, name) for name in STACKED}
     if settings.loadings.shape[1] <= FEW:
-        parts: dict[str, Array] = {name: each[unknowns.setting] for name, each in stacks.items()}
+        parts: dict[str, Shaped[Array, "n ..."]] = {name: each[unknowns.setting] for name, each in stacks.items()}
     else:
         parts = at_setting(stacks, unknowns.setting)
         if not has_steps(settings.likelihood):

@@ -15,7 +15,7 @@ from bayespbrl.models.preference_problem import PreferenceProblem
 
 # Gradients in a quarter of a rotation.
 GRADIENTS = 4
-_State = tuple[Array, Array, Array, Array]
+_State = tuple[Float[Array, " q"], Float[Array, " q"], Float[Array, ""], Float[Array, " q"]]
 
 
 def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProblem) -> Float[Array, " q"]:

@@ -69,7 +69,7 @@ class Actor:
         if not is_discrete(policy):
             raise ValueError(f"deterministic: expected a policy with a method mode, got {type(policy).__name__}")
         rows = np.asarray(self.observe(observation))[None]
-        return int(self.enact(int(np.argmax(policy.probabilities(rows)[0]))))  # type: ignore[union-attr]
+        return int(self.enact(int(np.argmax(policy.probabilities(rows)[0]))))
 
     def _drawn(self, policy: Sampler, observation: Any, key: Key[Array, ""] | None = None) -> Any:
         if key is None:
