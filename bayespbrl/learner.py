@@ -1,15 +1,15 @@
 """The learner: asks, takes answers, and moves through the cycle in between."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium
 import numpy as np
 
 from bayespbrl import events, queries, rollouts
 from bayespbrl.cycle import Cycle
-from bayespbrl.envs.opening import as_given, environment_attribute, environment_name, given_by_name
+from bayespbrl.envs.opening import AnyEnvironment, as_given, environment_attribute, environment_name, given_by_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
@@ -47,10 +47,10 @@ class Learner:
 
     def __init__(
         self,
-        env: Any,
+        env: AnyEnvironment,
         *,
         features: StateFeatures | None = None,
-        policy: Any = None,
+        policy: Policy | str | None = None,
         schedule: schedules.Schedule | str | None = None,
         query: queries.QueryRule | str | None = None,
         entries: Iterable[Entry] = (),
@@ -116,11 +116,11 @@ class Learner:
         return greedy(self.state.kept_policy) if tried else self.state.kept_policy
 
     @property
-    def last_policy(self) -> Any:
+    def last_policy(self) -> Policy:
         """The newest policy, which the next trajectories follow."""
         return self.state.policy
 
-    def first_policy(self) -> Any:
+    def first_policy(self) -> Policy:
         """The policy of the first trajectories: of the user's own, or random."""
         if self.own_policy is not None:
             return self.own_policy
@@ -298,9 +298,12 @@ def task_of(environment: gymnasium.Env, max_steps: int | None = None) -> Task:
     return Task(environment.observation_space, environment.action_space, horizon)
 
 
-def _chosen(option: str, given: Any, name: str, known: Any) -> Any:
+Choice = TypeVar("Choice")
+
+
+def _chosen(option: str, given: Choice | str | None, name: str, known: Mapping[str, Choice]) -> Choice:
     """The schedule or query rule: the user's own, or the known one of that name."""
-    if callable(given):
+    if given is not None and not isinstance(given, str):
         return given
     if name not in known:
         raise ValueError(f"{option}: expected a function of the user's own beside {name!r}, got none")

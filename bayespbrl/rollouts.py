@@ -144,7 +144,7 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
     raise ValueError(f"environment {environment_name(env)} states no time limit: expected max_steps, got None")
 
 
-def _checked(env: gymnasium.Env, policy: Any, key: Any, episodes: Any, max_steps: int | None) -> int:
+def _checked(env: gymnasium.Env, policy: object, key: object, episodes: int, max_steps: int | None) -> int:
     if not callable(getattr(policy, "sample", None)):
         raise ValueError(f"policy: expected an object with sample(key, observation), got {type(policy).__name__}")
     if not isinstance(key, jax.Array):

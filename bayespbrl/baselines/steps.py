@@ -1,6 +1,8 @@
 """What a baseline yields after each answer."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from bayespbrl.policies.policy import Sampler
 
 
 class Step(NamedTuple):
@@ -14,4 +16,4 @@ class Step(NamedTuple):
 
     answers: int
     pairs: int
-    policy: Any
+    policy: Sampler

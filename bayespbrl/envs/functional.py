@@ -6,14 +6,27 @@ compiled rollouts both go through them, so that the two views cannot drift apart
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import gymnasium
 import jax
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from jax import Array
-from jaxtyping import Key, UInt8
+from jaxtyping import Key, Shaped, UInt8
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+class Drawn(Protocol):
+    """What a drawing reads of a trajectory: its states (T+1, …), its number of steps and how it ended."""
+
+    @property
+    def states(self) -> Shaped[np.ndarray, "t1 ..."]: ...
+    @property
+    def terminated(self) -> bool: ...
+    def __len__(self) -> int: ...
 
 
 def reset(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Any, Any]:
@@ -104,7 +117,7 @@ class FunctionalEnv(gymnasium.Env):
 
 
 def picture(
-    draw: Callable[[Any], Any], *, inches: tuple[float, float] = (4.0, 4.0)
+    draw: Callable[["Axes"], object], *, inches: tuple[float, float] = (4.0, 4.0)
 ) -> UInt8[np.ndarray, "height width 3"]:
     """What `draw(axes)` draws, without matplotlib's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

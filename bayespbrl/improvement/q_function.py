@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, combinations
 from operator import add
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from gymnasium import Space
@@ -15,7 +15,8 @@ from jaxtyping import Float, Int, Key, Shaped
 from bayespbrl import checks
 from bayespbrl.features import StateActionFeatures
 from bayespbrl.improvement.lstd import Targets, TransitionSums, solve_lstd, transition_sums
-from bayespbrl.policies import clipped, is_discrete, sample_actions
+from bayespbrl.policies import Policy, clipped, is_discrete, sample_actions
+from bayespbrl.policies.policy import DiscretePolicy
 from bayespbrl.trajectories import Transitions
 
 ROWS_AT_A_TIME = 16_384
@@ -87,7 +88,7 @@ class CriticData:
 
 
 def estimate_q(
-    policy: Any,
+    policy: Policy,
     data: CriticData,
     *,
     key: Key[Array, ""],
@@ -117,7 +118,10 @@ def estimate_q(
     return QFunction(features, weights, np.reshape(halves, (-1, 2, len(weights))).T)
 
 
-def halvings(parts: Sequence[Any]) -> list[tuple[list[Any], list[Any]]]:
+Part = TypeVar("Part")
+
+
+def halvings(parts: Sequence[Part]) -> list[tuple[list[Part], list[Part]]]:
     """All divisions of the parts into two halves of as many: three of four parts, one of two or three, else none."""
     size = len(parts) // 2
     firsts = [each for each in combinations(range(len(parts)), size) if 0 in each] if size else []
@@ -125,7 +129,7 @@ def halvings(parts: Sequence[Any]) -> list[tuple[list[Any], list[Any]]]:
 
 
 def _sums(
-    policy: Any,
+    policy: Policy,
     data: CriticData,
     following: Shaped[np.ndarray, "n ..."] | None,
     features: StateActionFeatures,
@@ -139,7 +143,7 @@ def _sums(
     def sums(rows: slice) -> TransitionSums:
         current = _with_bias(features(chosen.states[rows], chosen.actions[rows]))
         if following is None:
-            successor = _expected_features(policy, chosen.next_states[rows], features)
+            successor = _expected_features(cast(DiscretePolicy, policy), chosen.next_states[rows], features)
         else:
             successor = features(chosen.next_states[rows], following[rows])
         successor = _with_bias(successor)
@@ -167,7 +171,7 @@ def _counted(
 
 
 def _expected_features(
-    policy: Any, states: Shaped[np.ndarray, "n ..."], features: StateActionFeatures
+    policy: DiscretePolicy, states: Shaped[np.ndarray, "n ..."], features: StateActionFeatures
 ) -> Float[np.ndarray, "n d"]:
     """Σₐ π(a|s)φ(s, a). Decision: where actions can be enumerated, their expectation replaces one fresh sample."""
     probabilities = policy.probabilities(states)

@@ -156,7 +156,7 @@ def decide(schedule: Schedule, situation: Situation) -> Bound:
     return Bound(float(value), bound.reason, signal, dict(bound.statistics))
 
 
-def _can_be_kept(figure: Any) -> bool:
+def _can_be_kept(figure: object) -> bool:
     """Whether JSON can hold it: a number, a text, None, or a list of them."""
     if isinstance(figure, list | tuple):
         return all(map(_can_be_kept, figure))

@@ -6,7 +6,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -24,7 +24,8 @@ from bayespbrl.improvement.reps import (
     reps_weights_by_state,
     whitened,
 )
-from bayespbrl.policies import clipped, entropies, is_discrete, sample_actions
+from bayespbrl.policies import Policy, clipped, entropies, is_discrete, sample_actions
+from bayespbrl.policies.policy import ContinuousPolicy, DiscretePolicy
 
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
 NOTHING = 1e-3  # of the bound; weights that have moved by less have nothing to gain
@@ -47,7 +48,7 @@ class ProposedUpdate:
       q_halves: Qᵢ by either half of the data, for each of m divisions into halves; None where it was not asked for.
     """
 
-    policy: Any
+    policy: Policy
     problem: UpdateProblem
     q_functions: QFunction
     samples: tuple[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, "n ..."]]
@@ -126,7 +127,7 @@ class Improvement:
         action's units; None for discrete actions.
     """
 
-    policy: Any
+    policy: Policy
     q_function: QFunction
     reps: RepsSolution
     updates: int
@@ -155,7 +156,7 @@ class Improvement:
 
 
 def propose(
-    policy: Any,
+    policy: Policy,
     problem: UpdateProblem,
     *,
     key: Key[Array, ""],
@@ -229,7 +230,7 @@ def apply_update(
         if number:
             proposed = propose(improved, proposed.problem, key=jax.random.fold_in(key, number))
         reps = proposed.solve(kl_bound)
-        fit = improved.fit_mean if number and hasattr(type(improved), "fit_mean") else improved.fit
+        fit = getattr(improved, "fit_mean" if number and hasattr(type(improved), "fit_mean") else "fit")
         improved = fit(*proposed.samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)  # eq. 14
         moved = float(visits @ improved.kl_divergence(policy, states))
         if moved >= NEARLY * kl_bound or reps.kl < NOTHING * kl_bound or not reps.converged:
@@ -244,12 +245,12 @@ def apply_update(
         entropy=float(visits @ entropies(improved, states)),
         action_standard_deviation=None
         if is_discrete(improved)
-        else tuple((visits @ improved.action_standard_deviation(states)).tolist()),
+        else tuple((visits @ cast(ContinuousPolicy, improved).action_standard_deviation(states)).tolist()),
     )
 
 
 def _all_actions(
-    policy: Any, states: Shaped[np.ndarray, "v ..."], visits: Float[np.ndarray, " v"]
+    policy: DiscretePolicy, states: Shaped[np.ndarray, "v ..."], visits: Float[np.ndarray, " v"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Every action of every visited state, weighted by q(a|s) × visits; actions that q excludes are left out."""
     weights = policy.probabilities(states) * visits[:, None]

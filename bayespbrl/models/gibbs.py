@@ -9,7 +9,7 @@ the weights change with it, its probabilities carry the volume |A| (reversible j
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,10 @@ def prior_draws(problem: JointProblem, rng: np.random.Generator, number: int) ->
     ]
 
 
-def at_setting(stacked_parts: Any, setting: Int[Array, ""]) -> Any:
+Parts = TypeVar("Parts")
+
+
+def at_setting(stacked_parts: Parts, setting: Int[Array, ""]) -> Parts:
     """The parts of one setting; without a copy where there is only one."""
     return jax.tree.map(lambda each: each[0] if len(each) == 1 else each[setting], stacked_parts)
 

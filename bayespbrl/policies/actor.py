@@ -42,8 +42,8 @@ class Actor:
     __call__ = act
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[Any, Any]:
+        self, observation: Any, state: object = None, episode_start: object = None, deterministic: bool = False
+    ) -> tuple[Any, object]:
         """Action and `state`, for one observation or a batch of them, as stable-baselines3's policies give.
 
         Args:

@@ -177,13 +177,13 @@ def _axis(where: str, axis: str, content: Mapping[str, Any]) -> dict[str, Option
     return dict(levels) or {"": {}}
 
 
-def _number(name: str, value: Any) -> float:
+def _number(name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{name}: expected a number, got {value!r}")
     return float(value)
 
 
-def _table(where: str, value: Any) -> dict[str, Any]:
+def _table(where: str, value: object) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"{where}: expected a table, got {value!r}")
     return value

@@ -174,7 +174,7 @@ def _with_iteration(contents: RunContents, iteration: int, file: Path, features:
         contents = replace(contents, answers=tuple(answers))
     if "estimate" in parts:
         contents = replace(contents, estimate=parts["estimate"], estimate_iteration=iteration)
-        missing = contents.features_missing or _features_failure(contents.estimate, features, parts["trajectories"][0])
+        missing = contents.features_missing or _features_failure(parts["estimate"], features, parts["trajectories"][0])
         contents = replace(contents, features_missing=missing)
     return contents
 
@@ -217,7 +217,7 @@ def _check_fitting(contents: RunContents, parts: Mapping[str, Any], features: St
         raise ValueError(f"the estimate fails ({type(error).__name__}: {' '.join(str(error).split())})") from error
 
 
-def _features_failure(estimate: Any, features: StateFeatures | None, trajectory: Trajectory) -> str:
+def _features_failure(estimate: UtilityEstimate, features: StateFeatures | None, trajectory: Trajectory) -> str:
     """What is wrong with features that were passed; empty if nothing."""
     if features is None or not of_states(estimate):
         return ""
