@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from toys import SHORT
 
 from bayespbrl import Learner, load, resume, start
 from bayespbrl.experts import ReturnExpert
@@ -165,7 +166,7 @@ def test_bad_options_are_refused(largest):
         ConfidenceBound(largest)
 
 
-QUICK = {"preset": "paper", "utility": "linear-program", "max_steps": 20, "evaluation_episodes": 3}
+QUICK = SHORT | {"utility": "linear-program"}
 
 
 def three_lines(situation):
