@@ -1,4 +1,4 @@
-"""What a baseline yields after each answer."""
+"""The result of a baseline after each answer."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ from bayespbrl.policies.policy import Sampler
 
 
 class Step(NamedTuple):
-    """Where a baseline stands after an answer.
+    """The state of a baseline after an answer.
 
     Attributes:
       answers: number of answers so far, ties included.

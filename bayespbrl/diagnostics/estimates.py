@@ -1,4 +1,4 @@
-"""What the diagnostics ask of a utility estimate: its posterior, and whether it is a utility of states."""
+"""Helpers for utility estimates: their posterior, and whether they are a utility of states."""
 
 from typing import TypeGuard
 
@@ -28,12 +28,12 @@ def expect_estimate(estimate: UtilityEstimate | None) -> UtilityEstimate:
 
 
 def of_states(estimate: UtilityEstimate | None) -> TypeGuard[StateUtility]:
-    """Whether it is a utility of states, as every estimate is but the known reward."""
+    """Whether the estimate is a utility of states, as all but the known reward are."""
     return isinstance(estimate, StateUtility)
 
 
 def number_of_features(estimate: StateUtility) -> int:
-    """D."""
+    """Number of features D."""
     return int(estimate.weights.shape[-1])
 
 

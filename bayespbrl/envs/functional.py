@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Drawn(Protocol):
-    """What a drawing reads of a trajectory: its states (T+1, …), its number of steps and how it ended."""
+    """The part of a trajectory that is drawn: states (T+1, …), number of steps, how it ended."""
 
     @property
     def states(self) -> Shaped[np.ndarray, "t1 ..."]: ...

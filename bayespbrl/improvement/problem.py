@@ -71,7 +71,7 @@ class PolicyUpdate:
 
 @dataclass(frozen=True, eq=False)
 class UpdateProblem:
-    """What all updates of one iteration share.
+    """The data and options that all updates of one iteration share.
 
     Attributes:
       steps: N observed transitions, under whatever policies.

@@ -73,7 +73,7 @@ class QFunction:
 
 @dataclass(frozen=True, eq=False)
 class CriticData:
-    """What Q is estimated from.
+    """The transitions and utilities that Q is estimated from.
 
     Attributes:
       steps: N transitions, under whatever policies.
@@ -122,7 +122,7 @@ Part = TypeVar("Part")
 
 
 def halvings(parts: Sequence[Part]) -> list[tuple[list[Part], list[Part]]]:
-    """All divisions of the parts into two halves of as many: three of four parts, one of two or three, else none."""
+    """All divisions of the parts into two halves: three of four parts, one of two or three, else none."""
     size = len(parts) // 2
     firsts = [each for each in combinations(range(len(parts)), size) if 0 in each] if size else []
     return [([parts[i] for i in each], [parts[i] for i in range(len(parts)) if i not in each]) for each in firsts]

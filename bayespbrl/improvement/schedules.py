@@ -23,7 +23,7 @@ LEAST_BOUND = 0.05  # nats; without any step there would be nothing to learn fro
 
 @dataclass(frozen=True)
 class Situation:
-    """What a schedule may look at.
+    """The information available to a schedule.
 
     Attributes:
       iteration: 1 for the first.
@@ -157,7 +157,7 @@ def decide(schedule: Schedule, situation: Situation) -> Bound:
 
 
 def _can_be_kept(figure: object) -> bool:
-    """Whether JSON can hold it: a number, a text, None, or a list of them."""
+    """Whether JSON can store it: a number, a text, None, or a list of them."""
     if isinstance(figure, list | tuple):
         return all(map(_can_be_kept, figure))
     return figure is None or isinstance(figure, int | float | str | np.number | np.bool_)

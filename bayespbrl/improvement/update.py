@@ -92,7 +92,7 @@ class ProposedUpdate:
 
     @cached_property
     def reliability(self) -> float:
-        """Share of the variance of the advantages that is no sampling error of Q; 1 without halves.
+        """Share of the variance of the advantages that is not sampling error of Q; 1 without halves.
 
         Source: Spearman (1910) and Brown (1910): 2r/(1 + r), with r the correlation of the advantages by the Q of two
         halves of the data, in the mean over the divisions into halves.

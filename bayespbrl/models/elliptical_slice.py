@@ -139,7 +139,7 @@ def independent_move(
 
 
 class _Walk(NamedTuple):
-    """Where a chain is within its moves.
+    """The state of a chain within its moves.
 
     Attributes:
       v, value: the point and its residual.
@@ -160,7 +160,7 @@ class _Walk(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """What all moves draw before the first.
+    """The random numbers of all moves, drawn before the first.
 
     Attributes:
       noise: ν of each move.

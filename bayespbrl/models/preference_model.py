@@ -89,7 +89,7 @@ class PreferenceModel:
 
 @dataclass(frozen=True)
 class Answers:
-    """What is known of K answers beside the order that the differences state; None: nothing.
+    """Ties, sides and answerers of K answers; None where they are not known.
 
     Attributes:
       indifferent, shown_first, answerers: as of `sample_posterior`, shape (K,).
@@ -114,7 +114,7 @@ class Answers:
         )
 
     def of(self, rows: ArrayLike) -> "Answers":
-        """Those of some rows; the answerers keep their numbers."""
+        """The answers of some rows; answerers keep their numbers."""
         chosen = np.asarray(rows)
 
         def some(part: ArrayLike | None) -> Shaped[np.ndarray, " n"] | None:

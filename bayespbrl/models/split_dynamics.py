@@ -1,4 +1,4 @@
-"""Hamiltonian dynamics split into a Gaussian's, which are a rotation, and what is left (Shahbaba et al. 2014).
+"""Hamiltonian dynamics split into a Gaussian part, a rotation, and a residual (Shahbaba et al. 2014).
 
 Given many answers the posterior of a smooth likelihood is nearly the Gaussian reference. Whitened by it, a quarter of a
 rotation forgets the start, and the gradient of the small residual is needed only a few times on the way.

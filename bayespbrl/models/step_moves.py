@@ -31,7 +31,7 @@ BESIDE = 1e-300  # a margin on one side of the step
 
 
 class Steps(NamedTuple):
-    """What the moves need beside the joint problem.
+    """Precomputed parts of the moves, beside the joint problem.
 
     Attributes:
       walls: of each setting, stacked.

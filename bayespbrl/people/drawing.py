@@ -126,7 +126,7 @@ SCENES: dict[str, Scene] = {
 
 
 def scene_of(environment: Env) -> Scene | None:
-    """How an observation of the environment is drawn; None where we do not know it."""
+    """How an observation of the environment is drawn; None where no drawing is known."""
     name = environment.spec.id if environment.spec is not None else ""
     if name in SCENES:
         return SCENES[name]

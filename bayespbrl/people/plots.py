@@ -1,4 +1,4 @@
-"""Plots of observations over time with a line that moves, for environments that nobody can draw.
+"""Plots of observations over time with a line that moves, for environments without a drawing.
 
 An environment, or its dynamics, may have `observation_names`, one for each entry of an observation.
 """

@@ -1,4 +1,4 @@
-"""A policy put to work: one observation in, one action for the environment out."""
+"""A policy acting in an environment: one observation in, one action out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A policy without its noise, which explores nothing: what a run keeps and is judged by."""
+"""A policy without its exploration noise: the form in which a run keeps and evaluates policies."""
 
 from dataclasses import dataclass
 

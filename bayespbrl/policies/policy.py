@@ -1,4 +1,4 @@
-"""What the learner asks of a stochastic policy π(a|s) (paper, preliminaries and eq. 14)."""
+"""The protocol of a stochastic policy π(a|s) (paper, preliminaries and eq. 14)."""
 
 from typing import Any, Protocol, Self, TypeGuard, runtime_checkable
 
@@ -12,7 +12,7 @@ AnyArray = Array | np.ndarray  # a policy holds NumPy's arrays, within a trace J
 
 
 class Sampler(Protocol):
-    """What a rollout needs of a policy."""
+    """The part of a policy that a rollout needs."""
 
     def sample(self, key: Key[Array, ""], observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
         """One action for one observation. Continuous actions are not clipped: the environment does that."""

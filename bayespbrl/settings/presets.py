@@ -125,7 +125,7 @@ PEOPLE: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Task:
-    """What the default preset looks at.
+    """The properties of a task that the default preset depends on.
 
     Attributes:
       observation_space, action_space: of the environment.
@@ -137,7 +137,7 @@ class Task:
     horizon: int
 
     def derived(self, *, people: bool) -> dict[str, Any]:
-        """Options by spaces and horizon, and by whether people answer, who wait.
+        """Options by spaces and horizon, and by whether people answer (they wait).
 
         Decision: Q looks a quarter of the horizon ahead; the noise of continuous actions is held for a fortieth of an
         episode (long for MountainCarContinuous; short for InvertedPendulum, which falls at once); in few dimensions

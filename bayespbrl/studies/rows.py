@@ -35,7 +35,7 @@ MOST_SEEDS_A_TRIAL = 10  # a study gives up after so many seeds per trial: prefe
 
 @dataclass(frozen=True)
 class Row:
-    """What all trials of a row share: plain data, since it is sent to other processes.
+    """The options that all trials of a row share: plain data, since it is sent to other processes.
 
     Attributes:
       env: a short name or a gymnasium id.
@@ -84,7 +84,7 @@ class Row:
         return True if measured and kept.finished() else None
 
     def redraws(self, summaries: Sequence[Mapping[str, Any]]) -> bool:
-        """Whether a trial with these summaries met no preference within the iterations that it has for that."""
+        """Whether a trial with these summaries met no preference within `preference_within` iterations."""
         within = self.preference_within
         return within is not None and len(summaries) >= within and summaries[within - 1]["pairs"] == 0
 

@@ -1,4 +1,4 @@
-"""What the other steps ask of a utility estimate: the protocol of its kinds."""
+"""The protocol of a utility estimate, used by the other steps."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -21,7 +21,7 @@ class UtilityEstimate(Protocol):
 
     @property
     def quality(self) -> FitQuality:
-        """How far the estimate can be trusted."""
+        """Convergence of the estimate, and its fit to the answers."""
         ...
 
     @property
@@ -34,7 +34,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def hyperparameters(self) -> dict[str, Any] | None:
-        """What was inferred beside the weights, as plain data; None where nothing was."""
+        """The inferred hyperparameters as plain data; None where there are none."""
         ...
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
@@ -58,7 +58,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def margin_draws(self, first: Trajectory, second: Trajectory) -> Float[np.ndarray, " s"]:
-        """By how much each draw prefers the first."""
+        """Utility of the first minus that of the second, under each draw."""
         ...
 
 
@@ -68,22 +68,22 @@ class WithoutDraws:
     posterior = None
 
     def hyperparameters(self) -> None:
-        """None: nothing."""
+        """None: a point estimate infers no hyperparameters."""
 
     def likelihood(self, number: int | None = None) -> Likelihood:
-        """None: a ValueError."""
+        """Raises ValueError: a point estimate has no draws."""
         raise self._no_posterior("likelihood")
 
     def utilities_and_draws(self, states: np.ndarray, *, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """None: a ValueError."""
+        """Raises ValueError: a point estimate has no draws."""
         raise self._no_posterior("utilities_and_draws")
 
     def trajectory_draws(self, trajectories: Sequence[Trajectory], *, number: int | None = None) -> np.ndarray:
-        """None: a ValueError."""
+        """Raises ValueError: a point estimate has no draws."""
         raise self._no_posterior("trajectory_draws")
 
     def margin_draws(self, first: Trajectory, second: Trajectory) -> np.ndarray:
-        """None: a ValueError."""
+        """Raises ValueError: a point estimate has no draws."""
         raise self._no_posterior("margin_draws")
 
     def _no_posterior(self, asked: str) -> ValueError:

@@ -1,4 +1,4 @@
-"""The posterior of the utility over everything that is unknown, and the utility that is acted on (paper, eqs. 7-8)."""
+"""The posterior of the utility over all unknowns, and the utility that the learner acts on (paper, eqs. 7-8)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -102,7 +102,7 @@ class PosteriorUtility:
         return self._drawn(self._of_trajectories(trajectories), self._apart(number))[1]
 
     def margin_draws(self, first: Trajectory, second: Trajectory) -> Float[np.ndarray, " s"]:
-        """By how much each draw prefers the first."""
+        """Utility of the first minus that of the second, under each draw."""
         draws = self.trajectory_draws([first, second])
         return draws[:, 0] - draws[:, 1]
 
