@@ -135,7 +135,7 @@ class Gridworld(FunctionalEnv):
     No terminal state; truncated after 300 steps.
 
     ## Source
-    Akrour, Schoenauer, Sebag, Souplet (2014), Programming by feedback; as used by Wirth, Fürnkranz, Neumann (2016).
+    Akrour, Schoenauer, Souplet, Sebag (2014), Programming by feedback; as used by Wirth, Fürnkranz, Neumann (2016).
     """
 
     def __init__(self, render_mode: str | None = None):
