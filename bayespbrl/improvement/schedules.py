@@ -116,12 +116,13 @@ class ConfidenceBound:
         reason = f"reliability of Q {signal:.2f}"
         if update.q_draws is not None:
             gains = update.gains()
-            square = float(np.mean(gains)) ** 2
-            total = square + float(np.var(gains))
+            square = float(np.mean(gains)) ** 2  # E[G]²
+            total = square + float(np.var(gains))  # E[G]² + Var[G]
+            # s = E[G]²/(E[G]² + Var[G]), as derived above
             signal *= square / total if total > 0 and np.mean(gains) > 0 else 0.0
             statistics["agreement"] = float(np.mean(gains > 0))
             reason = f"{statistics['agreement']:.0%} of the draws expect a gain, {reason}"
-        bound = max(LEAST_BOUND, signal**2 * self.largest)
+        bound = max(LEAST_BOUND, signal**2 * self.largest)  # KL grows with s²
         reason = f"{reason}; signal {signal:.2f}"
         if not quality.converged and bound > usual:
             return Bound(usual, f"{reason}; not converged: at most the run's own bound", signal, statistics)

@@ -40,6 +40,7 @@ def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProb
 
     def step(now: _State, _: None) -> tuple[_State, None]:
         x, velocity, _value, gradient = now
+        # Shahbaba et al. (2014): half a step by the residual, the Gaussian's rotation, half a step by the residual
         velocity = velocity + angle / 2 * gradient
         x, velocity = x * cos + velocity * sin, velocity * cos - x * sin
         value, gradient = with_gradient(x)
