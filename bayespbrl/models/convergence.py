@@ -117,7 +117,7 @@ def _effective_sample_size(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarra
     power = np.abs(rfft(centred, next_fast_len(2 * number), axis=1)) ** 2
     covariance = irfft(power, next_fast_len(2 * number), axis=1)[:, :number].mean(axis=0) / number
     variance = covariance[0] + np.var(split.mean(axis=1), axis=0, ddof=1)  # eq. 3
-    rho = 1 - (covariance[0] * number / (number - 1) - covariance) / variance  # eq. 10
+    rho = 1 - (covariance[0] * number / (number - 1) - covariance) / variance
     rho[0] = 1.0
     last = max(0, (number - 3) // 2)  # the last pair of lags that is looked at
     pairs = rho[0 : 2 * last + 2].reshape(last + 1, 2, quantities).sum(axis=1)
