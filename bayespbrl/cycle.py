@@ -41,7 +41,7 @@ HOLDS = 40  # of exploration, in an episode
 
 @dataclass(frozen=True)
 class Cycle:
-    """What stays the same over a run.
+    """The parts that stay the same over a run.
 
     Attributes:
       settings: all options.
@@ -90,7 +90,7 @@ class Cycle:
         return self.show(state, answerer)
 
     def _newcomers(self, state: LearnerState) -> list[int]:
-        """The candidates about whom, with their opponents, no open question is."""
+        """The candidates that no open question compares with their opponents."""
         taken, last = [{query.first, query.second} for query in state.open], state.preferences.undominated[-1:]
         newcomers = {query.newcomer for query in state.open}
         pairs = {number: {number, state.opponents.get(number, *last)} for number in state.candidates}

@@ -1,15 +1,15 @@
 """The learner: asks, takes answers, and moves through the cycle in between."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium
 import numpy as np
 
 from bayespbrl import events, queries, rollouts
 from bayespbrl.cycle import Cycle
-from bayespbrl.envs.opening import as_given, environment_attribute, environment_name, given_by_name
+from bayespbrl.envs.opening import AnyEnvironment, as_given, environment_attribute, environment_name, given_by_name
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
@@ -47,10 +47,10 @@ class Learner:
 
     def __init__(
         self,
-        env: Any,
+        env: AnyEnvironment,
         *,
         features: StateFeatures | None = None,
-        policy: Any = None,
+        policy: Policy | str | None = None,
         schedule: schedules.Schedule | str | None = None,
         query: queries.QueryRule | str | None = None,
         entries: Iterable[Entry] = (),
@@ -95,7 +95,7 @@ class Learner:
         self.state = events.replay(LearnerState(first, first), entries)
 
     def logged(self, log: Log) -> "Learner":
-        """The same learner, which from now on appends what happens to `log`."""
+        """The same learner, with each further event appended to `log`."""
         self.log = log
         return self
 
@@ -103,7 +103,7 @@ class Learner:
 
     @property
     def finished(self) -> bool:
-        """Whether all iterations are completed, or the budget of answers has done what it can."""
+        """Whether the run has ended: all iterations are completed, or further ones are not expected to help."""
         return self.state.finished(self.settings)
 
     @property
@@ -116,12 +116,12 @@ class Learner:
         return greedy(self.state.kept_policy) if tried else self.state.kept_policy
 
     @property
-    def last_policy(self) -> Any:
+    def last_policy(self) -> Policy:
         """The newest policy, which the next trajectories follow."""
         return self.state.policy
 
-    def first_policy(self) -> Any:
-        """The policy of the first trajectories: of the user's own, or random."""
+    def first_policy(self) -> Policy:
+        """The policy of the first trajectories: the user's own, or a random one."""
         if self.own_policy is not None:
             return self.own_policy
         options, environment = self.settings.rollouts, self.environment
@@ -231,7 +231,7 @@ class Learner:
         answerer: str | None = None,
         progress: Callable[["Learner"], None] | None = None,
     ) -> "Learner":
-        """Ask `expert` until all iterations are completed.
+        """Answer all questions by `expert` until the run ends.
 
         Args:
           expert: called with the two trajectories in the order shown.
@@ -252,7 +252,7 @@ class Learner:
         return self
 
     def widget(self, *, answers: int | None = None, answerer: str | None = None) -> "ComparisonWidget":
-        """What asks a person the questions in a notebook; needs the extra `people`.
+        """A notebook widget that asks a person the learner's questions; needs the extra `people`.
 
         Answers are told and questions asked in the background: cells stay free. `widget.close()` ends it; until then
         the learner must not be told anything else.
@@ -293,14 +293,17 @@ class Learner:
 
 
 def task_of(environment: gymnasium.Env, max_steps: int | None = None) -> Task:
-    """What the default preset looks at; `ValueError` where no time limit is known."""
+    """The properties of a task that the default preset depends on; `ValueError` where no time limit is known."""
     horizon = rollouts.step_limit(environment, max_steps)
     return Task(environment.observation_space, environment.action_space, horizon)
 
 
-def _chosen(option: str, given: Any, name: str, known: Any) -> Any:
+Choice = TypeVar("Choice")
+
+
+def _chosen(option: str, given: Choice | str | None, name: str, known: Mapping[str, Choice]) -> Choice:
     """The schedule or query rule: the user's own, or the known one of that name."""
-    if callable(given):
+    if given is not None and not isinstance(given, str):
         return given
     if name not in known:
         raise ValueError(f"{option}: expected a function of the user's own beside {name!r}, got none")

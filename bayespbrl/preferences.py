@@ -120,7 +120,7 @@ class Preferences:
 
     @property
     def shown_first(self) -> tuple[tuple[tuple[int, int], int], ...]:
-        """Those of the pairs and ties that were asked about, each with the side of its `Source`.
+        """The pairs and ties that were asked about, each with the side of its `Source`.
 
         What follows from an answer for other rivals was shown to nobody.
         """
@@ -128,12 +128,12 @@ class Preferences:
 
     @property
     def answered_by(self) -> tuple[tuple[tuple[int, int], str], ...]:
-        """Those of the pairs and ties whose answerer is known, each with the answerer's name."""
+        """The pairs and ties with a known answerer, each with the answerer's name."""
         return tuple((self._pair(each), each.answerer) for each in self.sources if each.answerer is not None)
 
     @property
     def answerers(self) -> tuple[str | None, ...]:
-        """All who answered, each once, in the order of their first answers; None is whoever gave no name."""
+        """All who answered, each once, in the order of their first answers; None stands for those without a name."""
         return tuple(dict.fromkeys(source.answerer for source in self.sources)) or (None,) * bool(self.answers)
 
     def rows(self) -> list[Source]:
@@ -229,7 +229,7 @@ class Preferences:
         return after._with_sources(self, asked, first, answerer)
 
     def without(self, answerer: str) -> "Preferences":
-        """The pairs and ties that do not follow from the answers of one; the undominated trajectories stay.
+        """The preferences without one person's answers; the undominated trajectories stay.
 
         Raises:
           ValueError: a name that nobody who answered has.
@@ -287,7 +287,7 @@ def pair_differences(
 
 
 def same_starts(trajectories: Sequence[Trajectory]) -> list[list[int]]:
-    """The numbers of the trajectories, those from one start together."""
+    """The numbers of the trajectories, grouped by their start."""
     groups: dict[bytes, list[int]] = {}
     for number, trajectory in enumerate(trajectories):
         groups.setdefault(np.asarray(trajectory.states[0]).tobytes(), []).append(number)
@@ -297,7 +297,7 @@ def same_starts(trajectories: Sequence[Trajectory]) -> list[list[int]]:
 def opponents_from_the_same_start(
     trajectories: Sequence[Trajectory], preferences: Preferences, favourites: Sequence[int]
 ) -> dict[int, int]:
-    """Whom each trajectory would be compared with: another from the same start, none where there is no other.
+    """The opponent of each trajectory: another from the same start; no entry where there is none.
 
     That is the newest undominated one that was shown, else one of `favourites`, else the first.
     """

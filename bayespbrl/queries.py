@@ -27,7 +27,7 @@ MOST_OLDER = 20  # their draws would soon cost more than all else
 
 @dataclass(frozen=True)
 class QuerySituation:
-    """What a query rule may look at.
+    """The information available to a query rule.
 
     Attributes:
       new: numbers of this iteration's trajectories.
@@ -188,7 +188,7 @@ def expected_information(
     *,
     likelihood: Likelihood,
 ) -> Float[np.ndarray, " n"]:
-    """What the answer to "this one or its opponent?" is expected to tell about the utility, in nats, ≤ log 2.
+    """Expected information gain of each comparison, in nats, at most log 2.
 
     The mutual information of answer and weights, H(E p) − E H(p), with p the likelihood of the one answer at each draw
     and H the entropy of a coin: it is large where the draws are each sure and do not agree. What no weights could
@@ -212,7 +212,7 @@ def expected_information(
 
 
 def _entropy(p: np.ndarray) -> np.ndarray:
-    """Of a coin, nats."""
+    """Entropy of a Bernoulli variable with probability p, in nats."""
     return entr(p) + entr(np.maximum(1 - p, 0.0))
 
 
@@ -232,6 +232,6 @@ def _fitting_draws(utilities: np.ndarray, opponents: np.ndarray) -> tuple[np.nda
 def show(
     number: int, newcomer: int, incumbent: int, trajectories: Sequence[Trajectory], *, rng: np.random.Generator
 ) -> Query:
-    """The question "newcomer or incumbent?", in an order drawn at random, so that no side is favoured."""
+    """The question "newcomer or incumbent?", with the order of the two drawn at random."""
     first, second = (newcomer, incumbent) if rng.random() < 0.5 else (incumbent, newcomer)
     return Query(number, first, second, newcomer, (trajectories[first], trajectories[second]))

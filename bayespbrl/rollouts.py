@@ -144,7 +144,7 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
     raise ValueError(f"environment {environment_name(env)} states no time limit: expected max_steps, got None")
 
 
-def _checked_step_limit(env: gymnasium.Env, policy: Any, key: Any, episodes: Any, max_steps: int | None) -> int:
+def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episodes: int, max_steps: int | None) -> int:
     if not callable(getattr(policy, "sample", None)):
         raise ValueError(f"policy: expected an object with sample(key, observation), got {type(policy).__name__}")
     if not isinstance(key, jax.Array):
@@ -161,7 +161,7 @@ def _layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
 
 
 def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
-    """The pure functions, unless something around them may change what they mean, as a user's wrapper might."""
+    """The pure functions; None where a wrapper around them, such as a user's, may change the environment."""
     *wrappers, inner = _layers(env)
     dynamics = getattr(inner, "dynamics", None)
     harmless = all(isinstance(layer, TimeLimit | OrderEnforcing | PassiveEnvChecker) for layer in wrappers)
@@ -200,7 +200,7 @@ def _advance(
     t: Int[AnyArray, ""],
     drawn: Int[Array, ""] | None = None,
 ) -> tuple[Running, tuple[Shaped[Array, "..."], Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]]:
-    """One step of one episode: how it goes on, and action, reward, whether it terminated, whether it was running.
+    """One step of one episode: the next state, and action, reward, whether it terminated, whether it was running.
 
     An episode that has ended stays as it is and earns nothing. The action draws the noise of step `drawn`; of its own
     when None.

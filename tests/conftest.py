@@ -91,18 +91,18 @@ COMPILER = (
 if version("jaxlib").startswith("0.10.") and COMPILER not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {COMPILER}".strip()
 
-QUICK = {"preset": "paper", "max_steps": 20, "evaluation_episodes": 3}
-
 
 @pytest.fixture(scope="session")
 def gridworld_run(tmp_path_factory):
     """Directory of a finished Gridworld run, posterior mean, second answer wrong, third a tie; not to be changed."""
+    from toys import SHORT
+
     import bayespbrl
 
     directory = tmp_path_factory.mktemp("runs") / "gridworld"
     right, wrong = bayespbrl.ReturnExpert(), bayespbrl.NoisyExpert(bayespbrl.ReturnExpert(), wrong_answers=1.0, seed=0)
     answers = iter([right, wrong, lambda first, second: "tie", right])
-    learner = bayespbrl.start("gridworld", directory, iterations=3, seed=7, **QUICK)
+    learner = bayespbrl.start("gridworld", directory, iterations=3, seed=7, **SHORT)
     learner.run(lambda first, second: next(answers)(first, second))
     return directory
 
@@ -116,12 +116,14 @@ def gridworld_copy(gridworld_run, tmp_path):
 @pytest.fixture(scope="session")
 def swing_up_learner(tmp_path_factory):
     """A finished swing-up run with all options of uncertainty: its directory and its learner; not to be changed."""
+    from toys import SHORT
+
     import bayespbrl
 
     directory = tmp_path_factory.mktemp("runs") / "swing-up"
     uncertainty = {"schedule": "confidence", "query": "information-when-unsure", "hyperparameters": "inferred"}
     options = {"updates_per_iteration": 2, "unasked_iterations": 1, "iterations": 4, "centres": 30, "seed": 3}
-    learner = bayespbrl.start("swing-up", directory, **uncertainty, **options, **QUICK)
+    learner = bayespbrl.start("swing-up", directory, **uncertainty, **options, **SHORT)
     return directory, learner.run(bayespbrl.ReturnExpert())
 
 

@@ -3,11 +3,10 @@
 import itertools
 import json
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box
 from test_trials import without_processes
+from toys import Push
 
 from bayespbrl.baselines import epmc, every_visit_preferences, pf, programming_by_feedback
 from bayespbrl.envs.gridworld import DYNAMICS, REWARDS, START
@@ -159,31 +158,16 @@ def test_values_of_actions_are_those_of_pairwise_coupling():
     assert epmc.best_actions(np.full((1, 3, 3), 0.5)).tolist() == [[1 / 3] * 3]
 
 
-class Push(gymnasium.Env):
-    """The return is the sum of the actions; observations are the time."""
-
-    observation_space, action_space = Box(0, 1, (1,)), Box(-1, 1, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.time += 1
-        return np.full(1, self.time / 4, np.float32), float(action[0]), False, self.time >= 4, {}
-
-
 @pytest.mark.slow
 def test_epmc_learns_which_action_is_the_best():
-    *_, last = every_visit_preferences(Push(), ReturnExpert(), answers=40, seed=4, max_steps=4)
+    *_, last = every_visit_preferences(Push(4), ReturnExpert(), answers=40, seed=4, max_steps=4)
     assert last.answers == 40
     assert 15 < last.pairs <= 40
     table = np.asarray(last.policy.table)
     visited = np.asarray(last.policy.cells(np.array([[0.0], [0.25], [0.5], [0.75]])))
     assert np.asarray(last.policy.actions)[:, 0].tolist() == [-1, 0, 1]
     assert table[visited].argmax(axis=1).tolist().count(2) >= 3
-    assert next(every_visit_preferences(Push(), lambda a, b: "tie", answers=1, seed=0, max_steps=4)).pairs == 0
+    assert next(every_visit_preferences(Push(4), lambda a, b: "tie", answers=1, seed=0, max_steps=4)).pairs == 0
 
 
 DECLARATION = """

@@ -13,6 +13,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 from gymnasium.utils.env_checker import check_env
 from matplotlib.figure import Figure
 from PIL import Image
+from toys import Odd
 
 from bayespbrl import envs
 from bayespbrl.envs import functional
@@ -170,24 +171,6 @@ def test_a_film_of_an_environment_that_cannot_draw_is_one_still():
 # Opening environments.
 
 
-class Odd(gymnasium.Env):
-    """A 2×3 box observed, actions 5, 6, 7 or a column of two numbers."""
-
-    observation_space = Box(-9.0, 9.0, (2, 3), dtype=np.float32)
-
-    def __init__(self, action_space):
-        self.action_space = action_space
-        self.received = None
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.arange(6, dtype=np.float32).reshape(2, 3), {}
-
-    def step(self, action):
-        self.received = action
-        return np.ones((2, 3), np.float32), 1.0, False, False, {}
-
-
 def test_short_names_open_the_registered_environments():
     assert {name: open_environment(name).spec.id for name in envs.SHORT_NAMES} == envs.SHORT_NAMES
 
@@ -198,11 +181,11 @@ def test_opening_what_is_open_changes_nothing():
 
 
 def test_shapes_are_flattened_and_discrete_actions_counted_from_zero():
-    inner = Odd(Discrete(3, start=5))
+    inner = Odd(Discrete(3, start=5), columns=3)
     opened = open_environment(inner)
     assert opened.observation_space.shape == (6,)
     assert opened.action_space == Discrete(3)
-    np.testing.assert_array_equal(opened.reset()[0], np.arange(6))
+    np.testing.assert_array_equal(opened.reset(seed=1)[0], inner.reset(seed=1)[0].ravel())
     opened.step(2)
     assert inner.received == 7
 

@@ -98,11 +98,11 @@ def test_q_of_utilities_side_by_side_is_that_of_each_alone():
     features = StateActionProduct(OneHot(STATES), ACTIONS)
     options = {"key": jax.random.key(1), "action_space": Discrete(ACTIONS), "features": features, "critic": CRITIC}
     together = q_function.estimate_q(
-        random_policy(), q_function.Evidence(steps, np.column_stack([utilities, others])), **options
+        random_policy(), q_function.CriticData(steps, np.column_stack([utilities, others])), **options
     )
     states, actions = np.divmod(np.arange(STATES * ACTIONS), ACTIONS)
     for column, alone in enumerate([utilities, *others.T]):
-        by_itself = q_function.estimate_q(random_policy(), q_function.Evidence(steps, alone), **options)
+        by_itself = q_function.estimate_q(random_policy(), q_function.CriticData(steps, alone), **options)
         np.testing.assert_allclose(together(states, actions)[:, column], by_itself(states, actions), atol=1e-9)
     assert together(states, actions).shape == (STATES * ACTIONS, 3)
 
@@ -124,7 +124,7 @@ def test_the_halves_are_q_from_half_of_the_transitions_and_the_whole_stays_as_it
     options = {"key": jax.random.key(1), "action_space": Discrete(ACTIONS), "features": features, "critic": CRITIC}
 
     def estimated(*data):
-        return q_function.estimate_q(random_policy(), q_function.Evidence(*data), **options)
+        return q_function.estimate_q(random_policy(), q_function.CriticData(*data), **options)
 
     q = estimated(steps, utilities, quarters)
     np.testing.assert_allclose(q.weights, estimated(steps, utilities).weights, atol=1e-5)
@@ -164,11 +164,11 @@ def test_q_is_the_same_however_many_transitions_are_taken_at_a_time(monkeypatch,
         (steps, utilities), space, policy = random_steps(terminated=True), Discrete(ACTIONS), random_policy()
         features = StateActionProduct(OneHot(STATES), ACTIONS)
     options = {"key": jax.random.key(1), "action_space": space, "features": features, "critic": CRITIC}
-    at_once = q_function.estimate_q(policy, q_function.Evidence(steps, utilities), **options)(
+    at_once = q_function.estimate_q(policy, q_function.CriticData(steps, utilities), **options)(
         steps.states, steps.actions
     )
     monkeypatch.setattr(q_function, "ROWS_AT_A_TIME", 7)
-    in_blocks = q_function.estimate_q(policy, q_function.Evidence(steps, utilities), **options)(
+    in_blocks = q_function.estimate_q(policy, q_function.CriticData(steps, utilities), **options)(
         steps.states, steps.actions
     )
     np.testing.assert_allclose(in_blocks, at_once, atol=1e-6)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Discrete
 from threadpoolctl import threadpool_info, threadpool_limits
-from toys import QUICK, Slope, fingerprint
+from toys import QUICK, Push, Slope, fingerprint
 
 from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, questions, resume, rollouts, start
 from bayespbrl import cycle as cycle_module
@@ -746,20 +746,6 @@ def test_exploration_is_held_for_a_share_of_the_first_episodes_where_they_end_ea
 
     monkeypatch.setattr(rollouts, "rollout", watched)
 
-    class Falls(gymnasium.Env):
-        """Ends by itself after 80 of at most 400 steps."""
-
-        observation_space, action_space = gymnasium.spaces.Box(-1, 1, (1,)), gymnasium.spaces.Box(-1, 1, (1,))
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            self.steps = 0
-            return np.zeros(1), {}
-
-        def step(self, action):
-            self.steps += 1
-            return np.clip(action, -1, 1).astype(float), float(action[0]), self.steps == 80, False, {}
-
     options = {"centres": 10, "evaluation_episodes": 2, "trajectories_per_iteration": 3, "seed": 1}
-    Learner(gymnasium.wrappers.TimeLimit(Falls(), 400), iterations=2, **options).run(ReturnExpert())
+    Learner(gymnasium.wrappers.TimeLimit(Push(80, ends=True), 400), iterations=2, **options).run(ReturnExpert())
     assert held == [10, 2]

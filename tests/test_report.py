@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from toys import SHORT
 
 import bayespbrl
 from bayespbrl import ReturnExpert
@@ -34,7 +35,7 @@ from bayespbrl.models.likelihoods import log_prob
 from bayespbrl.runs.iteration_files import read_iteration
 from bayespbrl.trajectories import trajectory_features
 
-QUICK = {"preset": "paper", "iterations": 3, "max_steps": 20, "evaluation_episodes": 3, "seed": 7}
+QUICK = SHORT | {"iterations": 3, "seed": 7}
 
 
 def start(directory, **changes):

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from toys import QUICK, fingerprint
+from toys import QUICK, Odd, fingerprint
 
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert
@@ -133,23 +133,6 @@ def test_the_policy_acts(finished):
     assert all(type(action) is int and 0 <= action < 5 for action in actions)
     key = jax.random.key(3)
     assert policy.act(np.int64(12), key=key) == policy.act(12, key=key) == policy(12, key=key)
-
-
-class Odd(gymnasium.Env):
-    """Spaces that the learner flattens and shifts."""
-
-    observation_space = gymnasium.spaces.Box(-1, 1, (2, 2))
-
-    def __init__(self, action_space):
-        self.action_space = action_space
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.np_random.uniform(-1, 1, (2, 2)), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action)
-        return self.np_random.uniform(-1, 1, (2, 2)), float(np.sum(action)), False, False, {}
 
 
 @pytest.mark.slow

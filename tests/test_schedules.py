@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from toys import SHORT
 
 from bayespbrl import Learner, load, resume, start
 from bayespbrl.experts import ReturnExpert
@@ -30,7 +31,7 @@ def proposed(draws=None, seed=0):
 def update_of(q_values, constraint, draws):
     """A proposed update as far as a schedule looks at it."""
     weights = np.full(len(q_values), 1 / len(q_values))
-    return ProposedUpdate(None, None, None, (), q_values, constraint, weights, draws)
+    return ProposedUpdate(None, None, None, (q_values, q_values), q_values, constraint, weights, draws)
 
 
 def situation(update, *, converged=True, usual=0.35):
@@ -186,7 +187,7 @@ def test_bad_options_are_refused(largest):
         ConfidenceBound(largest)
 
 
-QUICK = {"preset": "paper", "utility": "linear-program", "max_steps": 20, "evaluation_episodes": 3}
+QUICK = SHORT | {"utility": "linear-program"}
 
 
 def three_lines(situation):

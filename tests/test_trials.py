@@ -17,6 +17,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from toys import SHORT
 
 from bayespbrl import ReturnExpert, load, runs, start
 from bayespbrl.rollouts import returns
@@ -24,7 +25,7 @@ from bayespbrl.studies import Trials, rows, run_trials
 from bayespbrl.studies import trials as trials_module
 from bayespbrl.studies.tables import COLUMNS, collect
 
-QUICK = {"preset": "paper", "utility": "linear-program", "iterations": 2, "max_steps": 20, "evaluation_episodes": 3}
+QUICK = SHORT | {"utility": "linear-program", "iterations": 2}
 
 
 class ThisProcess:

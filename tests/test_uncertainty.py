@@ -25,7 +25,7 @@ from bayespbrl.diagnostics.uncertainty import (
     thinned,
 )
 from bayespbrl.features import OneHot
-from bayespbrl.improvement.q_function import Evidence, estimate_q
+from bayespbrl.improvement.q_function import CriticData, estimate_q
 from bayespbrl.models import PreferenceModel
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
 from bayespbrl.utility.comparisons import Comparisons
@@ -196,7 +196,7 @@ def test_q_of_each_draw_is_what_lstd_gives_for_its_utilities_alone():
     for number in (0, 77, 199):
         alone = estimate_q(
             learner.policy,
-            Evidence(steps, utilities[number]),
+            CriticData(steps, utilities[number]),
             key=jax.random.key(2),
             action_space=learner.environment.action_space,
             features=learner.cycle.feature_source.of_steps(

@@ -1,19 +1,13 @@
-"""A toy environment that can go wrong, a run that takes a second, and the comparison of two learners bit for bit."""
+"""Toy environments, runs that take a second, and the comparison of two learners bit for bit."""
 
 import gymnasium
 import jax
 import numpy as np
 from gymnasium.spaces import Box
 
-# A run of the paper's protocol that takes a second.
-QUICK = {
-    "preset": "paper",
-    "utility": "linear-program",
-    "iterations": 3,
-    "max_steps": 20,
-    "evaluation_episodes": 3,
-    "seed": 7,
-}
+# The paper's protocol with short episodes, and a run of it that takes a second.
+SHORT = {"preset": "paper", "max_steps": 20, "evaluation_episodes": 3}
+QUICK = SHORT | {"utility": "linear-program", "iterations": 3, "seed": 7}
 
 # Selects the page or the widget while it waits for an answer.
 READY = ".bp-box[data-phase=question][data-locked=false]"
@@ -41,6 +35,46 @@ class Slope(gymnasium.Env):
         self.position = self.position + 0.3 * float(action[0]) + self.np_random.normal(0, 0.02, 2)
         seen = np.full(2, np.nan) if fault == "observation" else self.position.copy()
         return seen, np.nan if fault == "reward" else float(self.position.sum()), False, False, {}
+
+
+class Odd(gymnasium.Env):
+    """A box of two rows observed, and any action space: the learner flattens and shifts them; keeps the last action."""
+
+    def __init__(self, action_space, columns=2):
+        self.observation_space = Box(-1.0, 1.0, (2, columns), dtype=np.float32)
+        self.action_space, self.received = action_space, None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._seen(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.received = action
+        return self._seen(), float(np.sum(action)), False, False, {}
+
+    def _seen(self):
+        return self.np_random.uniform(-1, 1, self.observation_space.shape).astype(np.float32)
+
+
+class Push(gymnasium.Env):
+    """The return is the sum of the actions; observations are the share of the steps; cut off or ended after them."""
+
+    observation_space, action_space = Box(0, 1, (1,)), Box(-1, 1, (1,))
+
+    def __init__(self, steps, ends=False):
+        self.steps, self.ends = steps, ends
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.time += 1
+        over = self.time >= self.steps
+        share = np.full(1, self.time / self.steps, np.float32)
+        return share, float(action[0]), over and self.ends, over and not self.ends, {}
 
 
 def fingerprint(learner):

@@ -196,6 +196,6 @@ def unit(points: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "n s"]:
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
 
 
-def tabular(policy: Int[np.ndarray, " s"], actions: int) -> Any:
+def tabular(policy: Int[np.ndarray, " s"], actions: int) -> TabularPolicy:
     """A deterministic policy as a table of probabilities."""
     return TabularPolicy(np.eye(actions)[policy])

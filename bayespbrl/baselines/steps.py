@@ -1,10 +1,12 @@
-"""What a baseline yields after each answer."""
+"""The result of a baseline after each answer."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from bayespbrl.policies.policy import Sampler
 
 
 class Step(NamedTuple):
-    """Where a baseline stands after an answer.
+    """The state of a baseline after an answer.
 
     Attributes:
       answers: number of answers so far, ties included.
@@ -14,4 +16,4 @@ class Step(NamedTuple):
 
     answers: int
     pairs: int
-    policy: Any
+    policy: Sampler

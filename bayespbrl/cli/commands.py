@@ -134,7 +134,7 @@ def resume(
     answerer: Answerer = None,
     import_package: ImportPackage = False,
 ) -> None:
-    """Continue an interrupted run; no answer is asked for twice."""
+    """Continue an interrupted run; no question is asked twice."""
     with continuing(directory):
         learner = runs.resume(directory, import_package=import_package)
         if not learner.finished:
@@ -150,10 +150,10 @@ def resume(
 def ask(
     directory: Annotated[Path, typer.Argument(help="Directory of a run that a person answers.")],
     *,
-    answers: Annotated[int | None, typer.Option(help="Most answers of this sitting.")] = None,
+    answers: Annotated[int | None, typer.Option(help="Maximum number of answers in this sitting.")] = None,
     answerer: Answerer = None,
     practice: Practice = True,
-    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 accepts other machines.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; a free one if omitted.")] = 0,
     import_package: ImportPackage = False,
 ) -> None:
@@ -221,7 +221,7 @@ def study(
     scheduler: Scheduler = None,
     out: Annotated[Path | None, typer.Option(help="Directory of the study; runs/study-NAME if omitted.")] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say how many cells there are, and how long.")
+        bool, typer.Option("--dry-run", help="Print the number of cells and the estimated time; run nothing.")
     ] = False,
 ) -> None:
     """Run a declared study: tasks, methods, noise, seeds. Finished cells are not repeated."""

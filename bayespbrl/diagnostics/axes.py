@@ -1,4 +1,4 @@
-"""What the figures share: labels, whole numbers along the x axis, a legend, numbered cells."""
+"""Helpers of the figures: labels, whole numbers along the x axis, a legend, numbered cells."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What the diagnostics ask of a utility estimate: its posterior, and whether it is a utility of states."""
+"""Helpers for utility estimates: their posterior, and whether they are a utility of states."""
 
 import numpy as np
 from xarray import DataTree

@@ -1,4 +1,4 @@
-"""Calibration of the schedule's confidence: how often was an update a gain, by what the schedule said of it?
+"""Calibration of the schedule's confidence: how often updates were gains, by the stated confidence.
 
 For runs whose hidden reward is known: it never enters the learner, and here it is the judge.
 """

@@ -1,4 +1,4 @@
-"""Those who answered: how often each lapses, favours a side, contradicts themselves, and how long they take."""
+"""The answerers: lapse rate, side bias, consistency and response time of each."""
 
 from collections.abc import Sequence
 
@@ -64,7 +64,7 @@ def _figures(name: str, past: Sequence[PastQuestion], posterior: xr.DataTree | N
 
 
 def _known_to(posterior: xr.DataTree | None, name: str, alone: str) -> xr.DataTree | None:
-    """The posterior, where answers of this person are among those that it was fitted to; else None."""
+    """The posterior, if it was fitted to answers of this person; else None."""
     if posterior is None:
         return None
     drawn = posterior.children["posterior"].dataset

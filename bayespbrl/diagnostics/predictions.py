@@ -125,7 +125,7 @@ def refit(tree: xr.DataTree, used: np.ndarray, **sampling_options: int) -> xr.Da
 
 
 def fitted_model(tree: xr.DataTree) -> PreferenceModel:
-    """The model that a tree's draws are from."""
+    """The model of a tree's draws."""
     options: dict[str, Any] = {field.name: tree.attrs[field.name] for field in fields(PreferenceModel)}
     for name, value in options.items():
         options[name] = None if value != value else value  # NaN: inferred

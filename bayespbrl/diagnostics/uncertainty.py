@@ -17,7 +17,7 @@ from scipy.stats import rankdata
 
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.estimates import expect_posterior
-from bayespbrl.improvement.q_function import Evidence, estimate_q
+from bayespbrl.improvement.q_function import CriticData, estimate_q
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Trajectory, transitions
 from bayespbrl.utility import UtilityEstimate
@@ -116,7 +116,7 @@ def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: 
     _, draws = fit.utilities_and_draws(steps.next_states, number=number)
     q = estimate_q(
         learner.state.kept_policy,
-        Evidence(steps, draws.T),
+        CriticData(steps, draws.T),
         key=jax.random.key(seed),
         action_space=learner.environment.action_space,
         features=learner.cycle.feature_source.of_steps(

@@ -3,7 +3,7 @@
 Constants and equations: Sutton and Barto (1998), Reinforcement learning: an introduction, figure 11.5, in SI units.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,10 @@ from jaxtyping import Bool, Float, Key
 
 from bayespbrl.envs.angles import wrapped
 from bayespbrl.envs.film_strip import Line, draw_film_strip, draw_pose
-from bayespbrl.envs.functional import FunctionalEnv
+from bayespbrl.envs.functional import Drawn, FunctionalEnv
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MASS_1 = MASS_2 = 1.0  # kg
 LENGTH_1 = LENGTH_2 = 1.0  # m
@@ -47,11 +50,11 @@ class AcrobotDynamics(FuncEnv):
     observation_period: tuple[float, ...] = (2 * np.pi, 2 * np.pi, np.inf, np.inf)
     frames_per_second = 1 / (SUBSTEPS * SUBSTEP_SECONDS)
 
-    def initial(self, rng: Key[Array, ""], params: Any = None) -> State:
+    def initial(self, rng: Key[Array, ""], params: None = None) -> State:
         """At rest, hanging down."""
         return jnp.zeros(4)
 
-    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: Any = None) -> State:
+    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: None = None) -> State:
         """One step: the torque clipped, then noise on it."""
         noise = jax.random.uniform(rng, minval=-TORQUE_NOISE, maxval=TORQUE_NOISE)
         return self.swing(state, jnp.clip(action[0], -MAX_TORQUE, MAX_TORQUE) + noise)
@@ -91,17 +94,17 @@ class AcrobotDynamics(FuncEnv):
         )
         return jnp.stack([-(d2 * second + phi1) / d1, second])
 
-    def observation(self, state: State, rng: Array | None = None, params: Any = None) -> State:
+    def observation(self, state: State, rng: Array | None = None, params: None = None) -> State:
         """The state itself."""
         return state
 
     def reward(
-        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: Any = None
+        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: None = None
     ) -> Float[Array, ""]:
         """−1 a step. Decision: the step that reaches the goal included, so that −return is the number of steps."""
         return jnp.asarray(-1.0)
 
-    def terminal(self, state: State, rng: Array | None = None, params: Any = None) -> Bool[Array, ""]:
+    def terminal(self, state: State, rng: Array | None = None, params: None = None) -> Bool[Array, ""]:
         """The tip more than 1 m above the first joint."""
         return -LENGTH_1 * jnp.cos(state[0]) - LENGTH_2 * jnp.cos(state[0] + state[1]) > GOAL_HEIGHT
 
@@ -114,13 +117,13 @@ class AcrobotDynamics(FuncEnv):
             np.stack([elbow, elbow + 0.5 * np.array([np.sin(both), -np.cos(both)])]),
         ]
 
-    def draw(self, observation: Float[np.ndarray, " s"], axes: Any) -> None:
+    def draw(self, observation: Float[np.ndarray, " s"], axes: "Axes") -> None:
         """Both links, and the height that the tip must pass."""
         axes.axhline(0.5 * GOAL_HEIGHT, linestyle=":", color="tab:green")
         draw_pose(self.pose(observation), axes)
         axes.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal", xticks=[], yticks=[])
 
-    def draw_trajectory(self, trajectory: Any, axes: Any) -> None:
+    def draw_trajectory(self, trajectory: Drawn, axes: "Axes") -> None:
         """A film strip of both links; the title says after how many steps the goal was reached."""
         draw_film_strip(self.pose, trajectory.states, axes, step_seconds=SUBSTEPS * SUBSTEP_SECONDS)
         outcome = "reached the goal" if trajectory.terminated else "did not reach the goal"

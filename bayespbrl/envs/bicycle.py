@@ -3,7 +3,7 @@
 Constants: Randløv and Alstrøm (1998), Learning to drive a bicycle using reinforcement learning and shaping; SI units.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,10 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Key
 
-from bayespbrl.envs.functional import FunctionalEnv
+from bayespbrl.envs.functional import Drawn, FunctionalEnv
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 VELOCITY = 10 / 3.6  # m/s, v
 GRAVITY = 9.82  # m/s², g (Denmark)
@@ -64,11 +67,11 @@ class BicycleDynamics(FuncEnv):
     observation_period: tuple[float, ...] = (np.inf,) * 4
     frames_per_second = 20.0  # a fifth of real time
 
-    def initial(self, rng: Key[Array, ""], params: Any = None) -> State:
+    def initial(self, rng: Key[Array, ""], params: None = None) -> State:
         """Uniform about riding straight and upright."""
         return jax.random.uniform(rng, (4,), minval=-1.0, maxval=1.0) * jnp.asarray(START_SPREAD)
 
-    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: Any = None) -> State:
+    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: None = None) -> State:
         """One step: both actions clipped, then noise on the displacement only."""
         torque = jnp.clip(action[0], -MAX_TORQUE, MAX_TORQUE)
         displacement = jnp.clip(action[1], -MAX_DISPLACEMENT, MAX_DISPLACEMENT)
@@ -100,21 +103,21 @@ class BicycleDynamics(FuncEnv):
         steering_acceleration = (torque - INERTIA_TYRE * SPIN * lean_speed) / INERTIA_STEERING  # θ̈
         return steering_acceleration, (tilting - righting) / INERTIA_BICYCLE  # ω̈
 
-    def observation(self, state: State, rng: Array | None = None, params: Any = None) -> State:
+    def observation(self, state: State, rng: Array | None = None, params: None = None) -> State:
         """The state itself."""
         return state
 
     def reward(
-        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: Any = None
+        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: None = None
     ) -> Float[Array, ""]:
         """−(ω′·15/π)² − 100·[fallen]. Decision: of several in the sources, the one that tells good riders apart."""
         return -((next_state[2] / FALL_ANGLE) ** 2) - 100.0 * self.terminal(next_state)
 
-    def terminal(self, state: State, rng: Array | None = None, params: Any = None) -> Bool[Array, ""]:
+    def terminal(self, state: State, rng: Array | None = None, params: None = None) -> Bool[Array, ""]:
         """The bicycle leans further than 12°."""
         return jnp.abs(state[2]) > FALL_ANGLE
 
-    def draw(self, observation: Float[np.ndarray, " s"], axes: Any) -> None:
+    def draw(self, observation: Float[np.ndarray, " s"], axes: "Axes") -> None:
         """From behind: the lean (magnified three times, with the fall's limits dotted) and the handlebar from above."""
         steering, lean = float(observation[0]), 3 * float(observation[2])
         for limit in (-3 * FALL_ANGLE, 3 * FALL_ANGLE):
@@ -127,7 +130,7 @@ class BicycleDynamics(FuncEnv):
         axes.set(xlim=(-1.1, 1.1), ylim=(-0.2, 1.4), aspect="equal", xticks=[], yticks=[])
         axes.set_title(f"lean {np.rad2deg(observation[2]):+.1f}°, handlebar {np.rad2deg(steering):+.1f}°")
 
-    def draw_trajectory(self, trajectory: Any, axes: Any) -> None:
+    def draw_trajectory(self, trajectory: Drawn, axes: "Axes") -> None:
         """Lean and handlebar over time, with the angles at which the bicycle has fallen."""
         seconds = STEP_SECONDS * np.arange(len(trajectory) + 1)
         degrees = np.rad2deg(np.asarray(trajectory.states))

@@ -1,18 +1,21 @@
 """A film strip: the poses of a trajectory side by side on one pair of axes."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Line = Float[np.ndarray, "points 2"]
 COLUMNS = 6
 MAX_POSES = 30
 
 
-def draw_pose(lines: Sequence[Line], axes: Any, *, offset: ArrayLike = (0.0, 0.0), width: float = 6.0) -> None:
+def draw_pose(lines: Sequence[Line], axes: "Axes", *, offset: ArrayLike = (0.0, 0.0), width: float = 6.0) -> None:
     """Connected limbs: each polyline is drawn with a joint at its first point."""
     for number, line in enumerate(lines):
         x, y = (np.asarray(line) + offset).T
@@ -23,7 +26,7 @@ def draw_pose(lines: Sequence[Line], axes: Any, *, offset: ArrayLike = (0.0, 0.0
 def draw_film_strip(
     pose: Callable[[Float[np.ndarray, " s"]], Sequence[Line]],
     states: Float[np.ndarray, "t s"],
-    axes: Any,
+    axes: "Axes",
     *,
     step_seconds: float,
 ) -> None:

@@ -6,14 +6,28 @@ compiled rollouts both go through them, so that the two views cannot drift apart
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import gymnasium
 import jax
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from jax import Array
-from jaxtyping import Key, UInt8
+from jaxtyping import Key, Shaped, UInt8
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+class Drawn(Protocol):
+    """The part of a trajectory that is drawn: states (T+1, …), number of steps, how it ended."""
+
+    @property
+    def states(self) -> Shaped[np.ndarray, "t1 ..."]: ...
+    @property
+    def terminated(self) -> bool: ...
+    def __len__(self) -> int: ...
+
 
 from bayespbrl.figures import new_figure, pixels
 
@@ -106,7 +120,7 @@ class FunctionalEnv(gymnasium.Env):
 
 
 def picture(
-    draw: Callable[[Any], Any], *, inches: tuple[float, float] = (4.0, 4.0)
+    draw: Callable[["Axes"], object], *, inches: tuple[float, float] = (4.0, 4.0)
 ) -> UInt8[np.ndarray, "height width 3"]:
     """What `draw(axes)` draws, without matplotlib's global state."""
     figure = new_figure(*inches, layout=None, dpi=80)  # a computed layout costs more than the drawing

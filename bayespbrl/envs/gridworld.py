@@ -1,6 +1,6 @@
 """The Gridworld of Akrour et al. (2014), the paper's first domain: the reward doubles towards one corner."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,10 @@ from gymnasium.spaces import Discrete
 from jax import Array
 from jaxtyping import Bool, Float, Int, Key
 
-from bayespbrl.envs.functional import FunctionalEnv
+from bayespbrl.envs.functional import Drawn, FunctionalEnv
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SIZE = 5
 STAY_PROBABILITY = 0.5
@@ -32,11 +35,11 @@ class GridworldDynamics(FuncEnv):
     grid_shape = (SIZE, SIZE)
     optimal_return = 294.8125  # expected over 300 steps, by dynamic programming on `transition_table`
 
-    def initial(self, rng: Key[Array, ""], params: Any = None) -> Cell:
+    def initial(self, rng: Key[Array, ""], params: None = None) -> Cell:
         """The centre cell."""
         return jnp.asarray(START)
 
-    def transition(self, state: Cell, action: Cell, rng: Key[Array, ""], params: Any = None) -> Cell:
+    def transition(self, state: Cell, action: Cell, rng: Key[Array, ""], params: None = None) -> Cell:
         """With probability ½ the move, else stay; moves off the grid are clamped."""
         succeeds = jax.random.bernoulli(rng, 1 - STAY_PROBABILITY)
         moved = self.move(state, action)
@@ -49,17 +52,17 @@ class GridworldDynamics(FuncEnv):
         row, column = jnp.clip(row + change[0], 0, SIZE - 1), jnp.clip(column + change[1], 0, SIZE - 1)
         return SIZE * row + column
 
-    def observation(self, state: Cell, rng: Array | None = None, params: Any = None) -> Cell:
+    def observation(self, state: Cell, rng: Array | None = None, params: None = None) -> Cell:
         """The state itself."""
         return state
 
     def reward(
-        self, state: Cell, action: Cell, next_state: Cell, rng: Array | None = None, params: Any = None
+        self, state: Cell, action: Cell, next_state: Cell, rng: Array | None = None, params: None = None
     ) -> Float[Array, ""]:
         """The reward of the *next* cell."""
         return jnp.asarray(REWARDS.reshape(-1))[next_state]
 
-    def terminal(self, state: Cell, rng: Array | None = None, params: Any = None) -> Bool[Array, ""]:
+    def terminal(self, state: Cell, rng: Array | None = None, params: None = None) -> Bool[Array, ""]:
         """Never."""
         return jnp.zeros_like(state, dtype=bool)
 
@@ -72,13 +75,13 @@ class GridworldDynamics(FuncEnv):
         table[states, actions, moved] += 1 - STAY_PROBABILITY
         return table
 
-    def draw(self, observation: np.int64, axes: Any) -> None:
+    def draw(self, observation: np.int64, axes: "Axes") -> None:
         """One position on the grid; the hidden reward is not shown, because who judges must not see it."""
         _draw_grid(axes)
         row, column = divmod(int(observation), SIZE)
         axes.scatter([column], [row], s=900, color="tab:blue", zorder=3)
 
-    def draw_trajectory(self, trajectory: Any, axes: Any) -> None:
+    def draw_trajectory(self, trajectory: Drawn, axes: "Axes") -> None:
         """How often each cell was visited (shade and number) and the path from the centre (lines, dot at its end)."""
         counts = np.bincount(np.asarray(trajectory.states), minlength=SIZE * SIZE).reshape(SIZE, SIZE)
         axes.imshow(counts, cmap="Blues", vmin=0, vmax=max(1, 1.3 * counts.max()))
@@ -91,7 +94,7 @@ class GridworldDynamics(FuncEnv):
         axes.set_title(f"visits in {len(trajectory)} steps")
 
 
-def _draw_grid(axes: Any) -> None:
+def _draw_grid(axes: "Axes") -> None:
     axes.set(xlim=(-0.5, SIZE - 0.5), ylim=(SIZE - 0.5, -0.5), aspect="equal", xlabel="column", ylabel="row")
     axes.set_xticks(range(SIZE), [str(j + 1) for j in range(SIZE)])
     axes.set_yticks(range(SIZE), [str(i + 1) for i in range(SIZE)])
@@ -132,7 +135,7 @@ class Gridworld(FunctionalEnv):
     No terminal state; truncated after 300 steps.
 
     ## Source
-    Akrour, Schoenauer, Sebag, Souplet (2014), Programming by feedback; as used by Wirth, Fürnkranz, Neumann (2016).
+    Akrour, Schoenauer, Souplet, Sebag (2014), Programming by feedback; as used by Wirth, Fürnkranz, Neumann (2016).
     """
 
     def __init__(self, render_mode: str | None = None):

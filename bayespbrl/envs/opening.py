@@ -23,7 +23,7 @@ _MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
 _GIVEN: WeakKeyDictionary[gymnasium.Env, gymnasium.Env] = WeakKeyDictionary()
 
 
-def imported_by_name(environment: Any) -> str:
+def imported_by_name(environment: object) -> str:
     """The module that opening `environment` would import, as gymnasium's "module:Env-v0"; empty for none.
 
     One that is imported already is none.
@@ -70,7 +70,7 @@ def environment_name(env: gymnasium.Env) -> str:
     return type(inner.dynamics if isinstance(inner, FunctionalEnv) else inner).__name__
 
 
-def given_by_name(environment: Any) -> bool:
+def given_by_name(environment: object) -> bool:
     """Whether the name alone opens the same environment again.
 
     It does not for an environment that was made with other arguments, wrapped, or never registered.
@@ -161,7 +161,7 @@ def _plain_space(space: Any) -> Any:
     return space if space.start == 0 else Discrete(int(space.n))
 
 
-def check_of_space(name: str, values: np.ndarray, space: Any) -> None:
+def check_of_space(name: str, values: np.ndarray, space: gymnasium.Space[Any]) -> None:
     """That rows are of a flattened space: shape (N, n), or whole numbers below its size; `ValueError` else."""
     if isinstance(space, Discrete):
         fits = values.ndim == 1 and values.dtype.kind in "iu" and bool(np.all((values >= 0) & (values < space.n)))

@@ -7,25 +7,28 @@ observations are drawn against time. No hidden reward is shown.
 import os
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Int, UInt8
 from PIL import Image
 
 from bayespbrl.checks import whole
-from bayespbrl.envs.functional import picture
+from bayespbrl.envs.functional import Drawn, picture
 from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, open_environment
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MAX_FRAMES = 100
 
 
-def draw_trajectory(environment: Any, trajectory: Any, axes: Any) -> Any:
+def draw_trajectory(environment: Any, trajectory: Drawn, axes: "Axes") -> "Axes":
     """Draw a whole trajectory on matplotlib `axes`, and return them.
 
     Args:
       environment: anything `open_environment` takes.
-      trajectory: has `states` (T+1, …), `actions` (T, …), `terminated` and a length.
+      trajectory: to draw.
       axes: matplotlib axes, of any figure.
     """
     own = environment_attribute(open_environment(environment), "draw_trajectory")
@@ -46,7 +49,7 @@ def draw_trajectory(environment: Any, trajectory: Any, axes: Any) -> Any:
 
 
 def frames(
-    environment: AnyEnvironment, trajectory: Any, *, max_frames: int = MAX_FRAMES
+    environment: AnyEnvironment, trajectory: Drawn, *, max_frames: int = MAX_FRAMES
 ) -> UInt8[np.ndarray, "f height width 3"]:
     """RGB pictures of the states, evenly spread, first and last among them.
 
@@ -61,7 +64,7 @@ def frames(
 
 
 def film(
-    environment: AnyEnvironment, trajectory: Any, path: str | os.PathLike[str], *, max_frames: int = MAX_FRAMES
+    environment: AnyEnvironment, trajectory: Drawn, path: str | os.PathLike[str], *, max_frames: int = MAX_FRAMES
 ) -> Path:
     """Write `frames` as an animated GIF, at the speed the dynamics state (`frames_per_second`, 10 by default)."""
     pictures = frames(environment, trajectory, max_frames=max_frames)
@@ -70,7 +73,7 @@ def film(
     return animation(pictures, path, milliseconds=1000 * stride / rate)
 
 
-def drawing(environment: AnyEnvironment, trajectory: Any, path: str | os.PathLike[str]) -> Path:
+def drawing(environment: AnyEnvironment, trajectory: Drawn, path: str | os.PathLike[str]) -> Path:
     """Write `draw_trajectory` as a PNG."""
     Image.fromarray(picture(partial(draw_trajectory, environment, trajectory), inches=(9.0, 7.0))).save(path, "PNG")
     return Path(path)

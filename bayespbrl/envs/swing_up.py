@@ -3,7 +3,7 @@
 Constants: the swing-up of the authors' published experiments (Wirth, Fürnkranz, Neumann 2016), in SI units.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,10 @@ from jaxtyping import Bool, Float, Key
 
 from bayespbrl.envs.angles import wrapped
 from bayespbrl.envs.film_strip import Line, draw_film_strip, draw_pose
-from bayespbrl.envs.functional import FunctionalEnv
+from bayespbrl.envs.functional import Drawn, FunctionalEnv
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MASS = 10.0  # kg
 LENGTH = 0.5  # m, from the pivot to where the weight acts
@@ -45,12 +48,12 @@ class SwingUpDynamics(FuncEnv):
     frames_per_second = 1 / CONTROL_STEP
     published_returns: tuple[tuple[str, float], ...] = (("every method of the paper, about", -1900.0),)
 
-    def initial(self, rng: Key[Array, ""], params: Any = None) -> State:
+    def initial(self, rng: Key[Array, ""], params: None = None) -> State:
         """At rest, within 0.2 rad of hanging down."""
         angle = jax.random.uniform(rng, minval=np.pi - START_SPREAD, maxval=np.pi + START_SPREAD)
         return jnp.stack([wrapped(angle), jnp.zeros_like(angle)])
 
-    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: Any = None) -> State:
+    def transition(self, state: State, action: Action, rng: Key[Array, ""], params: None = None) -> State:
         """One control step: noise on the torque, then the clip."""
         noise = TORQUE_NOISE * jax.random.normal(rng)
         return self.swing(state, jnp.clip(action[0] + noise, -MAX_TORQUE, MAX_TORQUE))
@@ -71,17 +74,17 @@ class SwingUpDynamics(FuncEnv):
         """θ̈ = 58.86 sin θ + 1.2 u − 0.2 θ̇."""
         return WEIGHT * jnp.sin(angle) + torque / INERTIA - FRICTION * speed
 
-    def observation(self, state: State, rng: Array | None = None, params: Any = None) -> State:
+    def observation(self, state: State, rng: Array | None = None, params: None = None) -> State:
         """The state itself."""
         return state
 
     def reward(
-        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: Any = None
+        self, state: State, action: Action, next_state: State, rng: Array | None = None, params: None = None
     ) -> Float[Array, ""]:
         """−10 θ² at the *current* state."""
         return -10.0 * wrapped(state[0]) ** 2
 
-    def terminal(self, state: State, rng: Array | None = None, params: Any = None) -> Bool[Array, ""]:
+    def terminal(self, state: State, rng: Array | None = None, params: None = None) -> Bool[Array, ""]:
         """Never."""
         return jnp.asarray(False)
 
@@ -90,12 +93,12 @@ class SwingUpDynamics(FuncEnv):
         angle = float(observation[0])
         return [np.array([[0.0, 0.0], [np.sin(angle), np.cos(angle)]])]
 
-    def draw(self, observation: Float[np.ndarray, " s"], axes: Any) -> None:
+    def draw(self, observation: Float[np.ndarray, " s"], axes: "Axes") -> None:
         """The pendulum, seen from the front."""
         draw_pose(self.pose(observation), axes)
         axes.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal", xticks=[], yticks=[])
 
-    def draw_trajectory(self, trajectory: Any, axes: Any) -> None:
+    def draw_trajectory(self, trajectory: Drawn, axes: "Axes") -> None:
         """A film strip of the pendulum."""
         draw_film_strip(self.pose, trajectory.states, axes, step_seconds=CONTROL_STEP)
 

@@ -1,4 +1,4 @@
-"""One event of a run: what a log keeps of it, and plain data for it."""
+"""One event of a run, and the plain data that a log keeps of it."""
 
 import math
 from collections.abc import Iterable, Mapping

@@ -1,4 +1,4 @@
-"""What the learner knows between two calls; the fold over the events makes each state from the one before."""
+"""The learner's state between two calls; the fold over the events makes each from the one before."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,7 @@ from bayespbrl.utility.estimate import UtilityEstimate
 
 @dataclass(frozen=True)
 class Restart:
-    """The policy was started anew.
+    """A restart of the policy.
 
     Attributes:
       iteration: iterations completed by then.
@@ -28,7 +28,7 @@ class Restart:
 
 @dataclass(frozen=True)
 class LearnerState:
-    """What the learner knows between two calls.
+    """The learner's state between two calls.
 
     Attributes:
       policy: the newest policy, which the next trajectories follow unless the policy is started anew.

@@ -1,4 +1,4 @@
-"""Whether an update was a step forward: the newest policy beside the best one, by the utility of their trajectories.
+"""Whether an update improved the policy: the newest compared with the best one, by the utility of their trajectories.
 
 An update follows an estimate of Q. Trajectories of the policy after it show what it did, and the posterior, not the
 hidden reward, says whether that is better. They are without the policy's noise and start alike for all policies, so
@@ -55,7 +55,7 @@ def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, tru
 
 
 def clearly_better(utility: UtilityEstimate, tried: Sequence[Trajectory], kept: Sequence[Trajectory]) -> bool:
-    """Whether a policy that was started anew, about which hardly anything is asked, replaces the one that is kept.
+    """Whether a restarted policy, about which hardly any question was asked, replaces the kept one.
 
     It does where `CLEARLY` of the draws prefer its trajectories to the kept policy's from the same starts; without a
     posterior, where the estimate does.

@@ -78,12 +78,12 @@ def solve_lstd(sums: TransitionSums, *, discount: float, fixed_point_ridge: floa
     if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross)) and np.all(np.isfinite(target))):
         raise ValueError("transitions: expected finite features and utilities, got NaN or infinity")
     size = len(gram)
-    # P[ΦᵀΦ′, Φᵀu]
+    # Hoffman et al. (2012), ℓ2–ℓ2, with Σ = PΦᵀ: P[ΦᵀΦ′, Φᵀu]
     projected = _solve_symmetric(gram, projection_ridge, np.column_stack([cross, target]))
-    mixing = np.eye(size) - discount * projected[:, :size]  # M: X = ΦM
+    mixing = np.eye(size) - discount * projected[:, :size]  # M: X = Φ − γΦΣΦ′ = ΦM
     normal = mixing.T @ gram @ mixing  # XᵀX
     projected_target = projected[:, size] if target.ndim == 1 else projected[:, size:]
-    return _solve_symmetric(normal, fixed_point_ridge, mixing.T @ (gram @ projected_target))  # θ
+    return _solve_symmetric(normal, fixed_point_ridge, mixing.T @ (gram @ projected_target))  # θ = (XᵀX + β₁I)⁻¹XᵀΦΣu
 
 
 def _solve_symmetric(matrix: Float[np.ndarray, "q q"], ridge: float, right: Targets) -> Targets:

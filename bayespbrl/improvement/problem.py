@@ -1,16 +1,16 @@
 """Step 2, the problem: how the policy is updated, and the data that the updates of an iteration share."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from gymnasium import Space
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from bayespbrl import checks
-from bayespbrl.features import StateActionFeatures
+from bayespbrl.features import StateActionFeatures, StateFeatures
 from bayespbrl.improvement.q_function import Critic
 from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.estimate import UtilityEstimate
@@ -68,32 +68,32 @@ class PolicyUpdate:
 
 @dataclass(frozen=True, eq=False)
 class UpdateProblem:
-    """What all updates of one iteration share.
+    """The data and options that all updates of one iteration share.
 
     Attributes:
       steps: N observed transitions, under whatever policies.
-      utilities: uᵢ of each.
-      states: those of the update, shape (n, S) or (n,).
+      utilities: uᵢ of each, shape (N,).
+      states: those of the update.
       critic: LSTD's options.
       state_action_features: φ(s, a) of Q.
       state_features: φ(s) of the constraint on the state distribution (eq. 11); not needed for discrete actions in
         continuous states.
       action_space: bounds the actions.
-      quarters: which quarter of the trajectories each transition is of, shape (N,); None where nobody asks for the
-        reliability of Q.
+      quarters: which quarter of the trajectories each transition is of; None where nobody asks for the reliability
+        of Q.
 
     Raises:
       ValueError: utilities that do not fit the transitions or are not finite.
     """
 
     steps: Transitions
-    utilities: np.ndarray
-    states: np.ndarray
+    utilities: Float[np.ndarray, "..."]
+    states: Shaped[np.ndarray, "m ..."]
     critic: Critic
     state_action_features: StateActionFeatures
-    state_features: Callable[[np.ndarray], np.ndarray]
+    state_features: StateFeatures
     action_space: Space[Any]
-    quarters: np.ndarray | None = None
+    quarters: Int[np.ndarray, " n"] | None = None
 
     def __post_init__(self) -> None:
         if self.utilities.shape != (len(self.steps),):
@@ -101,7 +101,7 @@ class UpdateProblem:
         checks.finite("utilities", self.utilities)
 
     @cached_property
-    def visited(self) -> tuple[np.ndarray, np.ndarray]:
+    def visited(self) -> tuple[Shaped[np.ndarray, "v ..."], Float[np.ndarray, " v"]]:
         """The states and the share of visits of each: discrete ones are counted, not repeated."""
         if self.states.ndim > 1:
             return self.states, np.full(len(self.states), 1 / len(self.states))
@@ -109,7 +109,7 @@ class UpdateProblem:
         return unique, counts / len(self.states)
 
     @cached_property
-    def constrained(self) -> np.ndarray:
+    def constrained(self) -> Float[np.ndarray, "v d"]:
         """φ(s) of the `visited` states, evaluated once for all updates."""
         return self.state_features(self.visited[0])
 
@@ -141,8 +141,8 @@ def quarters(trajectories: Sequence[Trajectory]) -> Int[np.ndarray, " n"]:
 
 def states_of_update(
     trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iteration: int, rng: np.random.Generator
-) -> np.ndarray:
-    """The states that a policy update takes, shape (n, S) or (n,).
+) -> Shaped[np.ndarray, "m ..."]:
+    """The states that a policy update takes.
 
     Args:
       trajectories: all so far, the newest last.

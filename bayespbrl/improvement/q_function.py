@@ -5,16 +5,18 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, combinations
 from operator import add
-from typing import Any
+from typing import Any, TypeVar, cast
 
-import jax
 import numpy as np
 from gymnasium import Space
+from jax import Array
+from jaxtyping import Float, Int, Key, Shaped
 
 from bayespbrl import checks
 from bayespbrl.features import StateActionFeatures
-from bayespbrl.improvement.lstd import TransitionSums, solve_lstd, transition_sums
-from bayespbrl.policies import clipped, is_discrete, sample_actions
+from bayespbrl.improvement.lstd import Targets, TransitionSums, solve_lstd, transition_sums
+from bayespbrl.policies import Policy, clipped, is_discrete, sample_actions
+from bayespbrl.policies.policy import DiscretePolicy
 from bayespbrl.trajectories import DISCOUNT, Transitions
 
 ROWS_AT_A_TIME = 16_384
@@ -45,47 +47,51 @@ class QFunction:
 
     Attributes:
       features: φ(s, a), from N states and N actions to (N, Q).
-      weights: θ, shape (Q + 1,), or (Q + 1, n) for n utilities side by side; the last row is the bias.
-      halves: θ of the first utility from either half of the data alone, for each of several divisions into halves,
-        shape (Q + 1, 2, divisions); None without quarters.
+      weights: θ, of one utility or of several side by side; the last row is the bias.
+      halves: θ of the first utility from either half of the data alone, for each of m divisions into halves; None
+        without quarters.
     """
 
     features: StateActionFeatures
-    weights: np.ndarray
-    halves: np.ndarray | None = None
+    weights: Targets
+    halves: Float[np.ndarray, "q 2 m"] | None = None
 
-    def __call__(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Q of N pairs, shape (N,), or (N, n)."""
+    def __call__(
+        self, states: Shaped[np.ndarray, "n ..."], actions: Shaped[np.ndarray, "n ..."]
+    ) -> Float[np.ndarray, "n *u"]:
+        """Q of N pairs, by each utility."""
         return self.with_halves(states, actions)[0]
 
-    def with_halves(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Q of N pairs, and that of the halves, shape (N, 2, divisions)."""
+    def with_halves(
+        self, states: Shaped[np.ndarray, "n ..."], actions: Shaped[np.ndarray, "n ..."]
+    ) -> tuple[Float[np.ndarray, "n *u"], Float[np.ndarray, "n 2 m"] | None]:
+        """Q of N pairs, and that of the halves."""
         table = _with_bias(self.features(states, actions))
         halves = None if self.halves is None else np.tensordot(table, self.halves, axes=1)
         return table @ self.weights, halves
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What Q is estimated from.
+class CriticData:
+    """The transitions and utilities that Q is estimated from.
 
     Attributes:
       steps: N transitions, under whatever policies.
-      utilities: uᵢ of each, shape (N,), or n of them side by side, (N, n).
-      quarters: which quarter of the trajectories each transition is of, 0 to 3, shape (N,): Q is also estimated from
+      utilities: uᵢ of each, or several of them side by side.
+      quarters: which quarter of the trajectories each transition is of, 0 to 3: Q is also estimated from
         half of the data, and what two halves disagree on is not told by the data; None: from all alone.
     """
 
     steps: Transitions
-    utilities: np.ndarray
-    quarters: np.ndarray | None = None
+    utilities: Float[np.ndarray, "n *u"]
+    quarters: Int[np.ndarray, " n"] | None = None
 
 
 def estimate_q(
-    policy: Any,
-    data: "Evidence",
+    policy: Policy,
+    data: CriticData,
     *,
-    key: jax.Array,
+    key: Key[Array, ""],
     action_space: Space[Any],
     features: StateActionFeatures,
     critic: Critic,
@@ -112,15 +118,22 @@ def estimate_q(
     return QFunction(features, weights, np.reshape(halves, (-1, 2, len(weights))).T)
 
 
-def halvings(parts: Sequence[Any]) -> list[tuple[list[Any], list[Any]]]:
-    """All divisions of the parts into two halves of as many: three of four parts, one of two or three, else none."""
+Part = TypeVar("Part")
+
+
+def halvings(parts: Sequence[Part]) -> list[tuple[list[Part], list[Part]]]:
+    """All divisions of the parts into two halves: three of four parts, one of two or three, else none."""
     size = len(parts) // 2
     firsts = [each for each in combinations(range(len(parts)), size) if 0 in each] if size else []
     return [([parts[i] for i in each], [parts[i] for i in range(len(parts)) if i not in each]) for each in firsts]
 
 
 def _sums(
-    policy: Any, data: Evidence, following: np.ndarray | None, features: StateActionFeatures, rows: np.ndarray
+    policy: Policy,
+    data: CriticData,
+    following: Shaped[np.ndarray, "n ..."] | None,
+    features: StateActionFeatures,
+    rows: Int[np.ndarray, " r"],
 ) -> TransitionSums:
     """LSTD's sums over some of the transitions."""
     chosen = Transitions(*(column[rows] for column in vars(data.steps).values()))
@@ -130,7 +143,7 @@ def _sums(
     def sums(rows: slice) -> TransitionSums:
         current = _with_bias(features(chosen.states[rows], chosen.actions[rows]))
         if following is None:
-            successor = _expected_features(policy, chosen.next_states[rows], features)
+            successor = _expected_features(cast(DiscretePolicy, policy), chosen.next_states[rows], features)
         else:
             successor = features(chosen.next_states[rows], following[rows])
         successor = _with_bias(successor)
@@ -143,7 +156,9 @@ def _sums(
     return reduce(add, map(sums, blocks))
 
 
-def _counted(steps: Transitions, utilities: np.ndarray) -> tuple[Transitions, np.ndarray, np.ndarray]:
+def _counted(
+    steps: Transitions, utilities: Float[np.ndarray, "n *u"]
+) -> tuple[Transitions, Float[np.ndarray, "m *u"], Float[np.ndarray, " m"]]:
     """Discrete transitions once each, with the mean of their utilities and how often they occurred."""
     if steps.states.ndim > 1 or steps.actions.ndim > 1:
         return steps, utilities, np.ones(len(steps))
@@ -155,14 +170,16 @@ def _counted(steps: Transitions, utilities: np.ndarray) -> tuple[Transitions, np
     return Transitions(*(column[first] for column in vars(steps).values())), means, counts.astype(float)
 
 
-def _expected_features(policy: Any, states: np.ndarray, features: StateActionFeatures) -> np.ndarray:
+def _expected_features(
+    policy: DiscretePolicy, states: Shaped[np.ndarray, "n ..."], features: StateActionFeatures
+) -> Float[np.ndarray, "n d"]:
     """Σₐ π(a|s)φ(s, a). Decision: where actions can be enumerated, their expectation replaces one fresh sample."""
     probabilities = policy.probabilities(states)
-    total: np.ndarray = probabilities[:, :1] * features(states, np.zeros(len(states), dtype=np.int64))
+    total: Float[np.ndarray, "n d"] = probabilities[:, :1] * features(states, np.zeros(len(states), dtype=np.int64))
     for action in range(1, probabilities.shape[1]):
         total += probabilities[:, action, None] * features(states, np.full(len(states), action))
     return total
 
 
-def _with_bias(features: np.ndarray) -> np.ndarray:
+def _with_bias(features: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d+1"]:
     return np.column_stack([features, np.ones(len(features))])

@@ -22,7 +22,7 @@ LEAST_BOUND = 0.05  # nats; without any step there would be nothing to learn fro
 
 @dataclass(frozen=True)
 class Situation:
-    """What a schedule may look at.
+    """The information available to a schedule.
 
     Attributes:
       iteration: 1 for the first.
@@ -111,12 +111,13 @@ class ConfidenceBound:
         reason = f"reliability of Q {signal:.2f}"
         if update.q_draws is not None:
             gains = update.gains()
-            square = float(np.mean(gains)) ** 2
-            total = square + float(np.var(gains))
+            square = float(np.mean(gains)) ** 2  # E[G]²
+            total = square + float(np.var(gains))  # E[G]² + Var[G]
+            # s = E[G]²/(E[G]² + Var[G]), as derived above
             signal *= square / total if total > 0 and np.mean(gains) > 0 else 0.0
             statistics["agreement"] = float(np.mean(gains > 0))
             reason = f"{statistics['agreement']:.0%} of the draws expect a gain, {reason}"
-        bound = max(LEAST_BOUND, signal**2 * self.largest)
+        bound = max(LEAST_BOUND, signal**2 * self.largest)  # KL grows with s²
         reason = f"{reason}; signal {signal:.2f}"
         if not quality.converged and bound > usual:
             return Bound(usual, f"{reason}; not converged: at most the run's own bound", signal, statistics)
@@ -148,8 +149,8 @@ def decide(schedule: Schedule, situation: Situation) -> Bound:
     return Bound(value, bound.reason, signal, dict(bound.statistics))
 
 
-def _can_be_kept(figure: Any) -> bool:
-    """Whether JSON can hold it: a number, a text, None, or a list of them."""
+def _can_be_kept(figure: object) -> bool:
+    """Whether JSON can store it: a number, a text, None, or a list of them."""
     if isinstance(figure, list | tuple):
         return all(map(_can_be_kept, figure))
     return figure is None or isinstance(figure, int | float | str | np.number | np.bool_)

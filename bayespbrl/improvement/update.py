@@ -6,15 +6,16 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jax import Array
+from jaxtyping import Float, Int, Key, Shaped
 
 from bayespbrl import checks
 from bayespbrl.improvement.problem import UpdateProblem
-from bayespbrl.improvement.q_function import Evidence, QFunction, estimate_q
+from bayespbrl.improvement.q_function import CriticData, QFunction, estimate_q
 from bayespbrl.improvement.reps import (
     RepsSolution,
     WhitenedFeatures,
@@ -23,7 +24,8 @@ from bayespbrl.improvement.reps import (
     reps_weights_by_state,
     whitened,
 )
-from bayespbrl.policies import clipped, entropies, is_discrete, sample_actions
+from bayespbrl.policies import Policy, clipped, entropies, is_discrete, sample_actions
+from bayespbrl.policies.policy import ContinuousPolicy, DiscretePolicy
 
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
 NOTHING = 1e-3  # of the bound; weights that have moved by less have nothing to gain
@@ -46,10 +48,10 @@ class ProposedUpdate:
       q_halves: Qᵢ by either half of the data, for each of m divisions into halves; None where it was not asked for.
     """
 
-    policy: Any
+    policy: Policy
     problem: UpdateProblem
     q_functions: QFunction
-    samples: tuple[np.ndarray, np.ndarray]
+    samples: tuple[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, "n ..."]]
     q_values: Float[np.ndarray, " n"]
     state_features: Float[np.ndarray, "n d"] | Int[np.ndarray, " n"]
     base_weights: Float[np.ndarray, " n"]
@@ -58,7 +60,7 @@ class ProposedUpdate:
     solved: dict[float, RepsSolution] = field(default_factory=dict, repr=False)
 
     @cached_property
-    def constraint(self) -> WhitenedFeatures | np.ndarray:
+    def constraint(self) -> WhitenedFeatures | Int[np.ndarray, " n"]:
         """The whitened features, which every bound shares; or the states' numbers."""
         if self.state_features.ndim == 1:
             return self.state_features
@@ -90,7 +92,7 @@ class ProposedUpdate:
 
     @cached_property
     def reliability(self) -> float:
-        """Share of the variance of the advantages that is no sampling error of Q; 1 without halves.
+        """Share of the variance of the advantages that is not sampling error of Q; 1 without halves.
 
         Source: Spearman (1910) and Brown (1910): 2r/(1 + r), with r the correlation of the advantages by the Q of two
         halves of the data, in the mean over the divisions into halves.
@@ -125,7 +127,7 @@ class Improvement:
         action's units; None for discrete actions.
     """
 
-    policy: Any
+    policy: Policy
     q_function: QFunction
     reps: RepsSolution
     updates: int
@@ -154,7 +156,11 @@ class Improvement:
 
 
 def propose(
-    policy: Any, problem: UpdateProblem, *, key: jax.Array, utility_draws: Float[np.ndarray, "n s"] | None = None
+    policy: Policy,
+    problem: UpdateProblem,
+    *,
+    key: Key[Array, ""],
+    utility_draws: Float[np.ndarray, "n s"] | None = None,
 ) -> ProposedUpdate:
     """Q under `policy`, and the samples whose weights an update would change.
 
@@ -171,7 +177,7 @@ def propose(
     next_key, fresh_key = jax.random.split(key)
     q_functions = estimate_q(
         policy,
-        Evidence(problem.steps, columns, problem.quarters),
+        CriticData(problem.steps, columns, problem.quarters),
         key=next_key,
         action_space=problem.action_space,
         features=problem.state_action_features,
@@ -204,7 +210,7 @@ def propose(
 
 
 def apply_update(
-    proposed: ProposedUpdate, kl_bound: float, *, key: jax.Array, rng: np.random.Generator, updates: int = 1
+    proposed: ProposedUpdate, kl_bound: float, *, key: Key[Array, ""], rng: np.random.Generator, updates: int = 1
 ) -> Improvement:
     """The policy after the proposed update at this bound, and further ones while they have something to gain.
 
@@ -224,7 +230,7 @@ def apply_update(
         if number:
             proposed = propose(improved, proposed.problem, key=jax.random.fold_in(key, number))
         reps = proposed.solve(kl_bound)
-        fit = improved.fit_mean if number and hasattr(type(improved), "fit_mean") else improved.fit
+        fit = getattr(improved, "fit_mean" if number and hasattr(type(improved), "fit_mean") else "fit")
         improved = fit(*proposed.samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)  # eq. 14
         moved = float(visits @ improved.kl_divergence(policy, states))
         if moved >= NEARLY * kl_bound or reps.kl < NOTHING * kl_bound or not reps.converged:
@@ -239,13 +245,13 @@ def apply_update(
         entropy=float(visits @ entropies(improved, states)),
         action_standard_deviation=None
         if is_discrete(improved)
-        else tuple((visits @ improved.action_standard_deviation(states)).tolist()),
+        else tuple((visits @ cast(ContinuousPolicy, improved).action_standard_deviation(states)).tolist()),
     )
 
 
 def _all_actions(
-    policy: Any, states: np.ndarray, visits: Float[np.ndarray, " n"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    policy: DiscretePolicy, states: Shaped[np.ndarray, "v ..."], visits: Float[np.ndarray, " v"]
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Every action of every visited state, weighted by q(a|s) × visits; actions that q excludes are left out."""
     weights = policy.probabilities(states) * visits[:, None]
     rows, actions = np.nonzero(weights)

@@ -1,4 +1,4 @@
-"""Threads of the linear algebra."""
+"""Number of threads of the linear algebra."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager

@@ -1,4 +1,4 @@
-"""Chains on everything that is unknown: Gibbs moves and elliptical slices, by one compiled sampler a capacity."""
+"""Chains over all unknowns: Gibbs moves and elliptical slices, by one compiled sampler a capacity."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -153,11 +153,11 @@ class Chains:
 
     @property
     def length(self) -> int:
-        """Draws a chain so far."""
+        """Number of draws in each chain so far."""
         return sum(len(part["stuck"][0]) for part in self.draws)
 
     def extended(self, more: int) -> "Chains":
-        """At least `more` draws longer."""
+        """The same chains, at least `more` draws longer."""
         draws, state, unknowns = list(self.draws), self.state, self.unknowns
         for _ in range(-(-more // self.chunk)):
             (state, unknowns), (states, them, answers) = self._next_chunk(state, unknowns, compiled=bool(draws))
@@ -174,7 +174,7 @@ class Chains:
         return flight_chunk(state, unknowns, self.problem, self.steps, length=self.chunk, at_once=compiled)
 
     def collected(self, name: str, length: int) -> Shaped[np.ndarray, "chain {length} ..."]:
-        """The first `length` draws of what is called `name`."""
+        """The first `length` draws of the variable `name`."""
         return np.concatenate([part[name] for part in self.draws], axis=1)[:, :length]
 
     def values(self, name: str, length: int) -> Shaped[np.ndarray, "chain {length} ..."]:

@@ -106,8 +106,9 @@ def _rank_normalised(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarray, "m 
 def _split_rhat(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarray, " q"]:
     """R̂ (Vehtari et al. 2021, eqs. 1-4)."""
     number = split.shape[1]
+    # eqs. 1-2: B/N and W
     between, within = np.var(split.mean(axis=1), axis=0, ddof=1), np.mean(np.var(split, axis=1, ddof=1), axis=0)
-    return np.asarray(np.sqrt(between / within + (number - 1) / number))
+    return np.asarray(np.sqrt(between / within + (number - 1) / number))  # eqs. 3-4
 
 
 def _effective_sample_size(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarray, " q"]:
@@ -116,7 +117,7 @@ def _effective_sample_size(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarra
     centred = split - split.mean(axis=1, keepdims=True)
     power = np.abs(rfft(centred, next_fast_len(2 * number), axis=1)) ** 2
     covariance = irfft(power, next_fast_len(2 * number), axis=1)[:, :number].mean(axis=0) / number
-    variance = covariance[0] + np.var(split.mean(axis=1), axis=0, ddof=1)
+    variance = covariance[0] + np.var(split.mean(axis=1), axis=0, ddof=1)  # eq. 3
     rho = 1 - (covariance[0] * number / (number - 1) - covariance) / variance
     rho[0] = 1.0
     last = max(0, (number - 3) // 2)  # the last pair of lags that is looked at

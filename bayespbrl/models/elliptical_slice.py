@@ -42,8 +42,11 @@ class Ellipse(NamedTuple):
     noise: Callable[[PRNGKeyArray, int], Float[Array, " moves *v"]]
     residual: Callable[[Float[Array, " j *v"]], Float[Array, " j"]]
     lower: Callable[[Float[Array, "*v"]], Float[Array, " n"]]
-    turn: Callable[[Float[Array, "*v"], Array, Float[Array, " j"]], Float[Array, " j *v"]] = turned
+    turn: Callable[[Float[Array, "*v"], Float[Array, "*v"], Float[Array, " j"]], Float[Array, " j *v"]] = turned
     batch: int | None = None
+
+
+_Bracket = tuple[Float[Array, "*m"], Float[Array, "*m"], Float[Array, "*m"]]  # the angle, and its ends
 
 
 def shrink(
@@ -64,9 +67,7 @@ def shrink(
     """
 
     # a loop rather than unrolled: the compiler would fuse the steps into each other, again and again
-    def step(
-        bracket: tuple[Array, Array, Array], uniform: Float[Array, "*m"]
-    ) -> tuple[tuple[Array, Array, Array], Array]:
+    def step(bracket: _Bracket, uniform: Float[Array, "*m"]) -> tuple[_Bracket, Float[Array, "*m"]]:
         angle, low, high = bracket
         low, high = jnp.where(angle < 0, angle, low), jnp.where(angle < 0, high, angle)
         angle = low + (high - low) * uniform
@@ -138,7 +139,7 @@ def independent_move(
 
 
 class _Walk(NamedTuple):
-    """Where a chain is within its moves.
+    """The state of a chain within its moves.
 
     Attributes:
       v, value: the point and its residual.
@@ -159,7 +160,7 @@ class _Walk(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """What all moves draw before the first.
+    """The random numbers of all moves, drawn before the first.
 
     Attributes:
       noise: ν of each move.
@@ -188,11 +189,15 @@ def _drawn(key: PRNGKeyArray, ellipse: Ellipse, dtype: jnp.dtype, *, moves: int,
     return _Drawn(noise, heights, angles, brackets, random.split(key_more, moves))
 
 
+# angles, their bracket, and the number of the batch that is wanted
+_Candidates = tuple[Float[Array, " batch"], Float[Array, "3"], Int[Array, ""]]
+
+
 def _next_candidates(walk: _Walk, drawn: _Drawn) -> tuple[Float[Array, " batch"], Float[Array, "3"]]:
     """The next batch of angles of the walk's move: drawn ahead, or now where those are used up; and the bracket."""
     _, ahead, batch = drawn.angles.shape
 
-    def draw(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def draw(state: _Candidates) -> _Candidates:
         _, bracket, wanted = state
         last, low, high = jnp.where(wanted == ahead, drawn.brackets[walk.move], bracket)
         key = random.fold_in(drawn.keys[walk.move], wanted * batch)

@@ -175,7 +175,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
     def _model_ellipses(
         self,
         x: Float[Array, " n"],
-        unravel: Callable[[Array], Values],
+        unravel: Callable[[Float[Array, " n"]], Values],
         key: PRNGKeyArray,
         model_args: Args,
         model_kwargs: Keywords,

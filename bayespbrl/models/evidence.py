@@ -51,7 +51,7 @@ def _bridged(
     effective, number = relative * len(posterior), len(proposal)
     log_share, log_rest = np.log([effective / (effective + number), number / (effective + number)])
     estimate = 0.0 if np.all(proposal == -np.inf) else float(logsumexp(proposal) - np.log(number))
-    for _ in range(ITERATIONS):
+    for _ in range(ITERATIONS):  # Meng & Wong (1996), eq. 4.1, in logarithms
         above = proposal - np.logaddexp(log_share + proposal, log_rest + estimate)
         below = -np.logaddexp(log_share + posterior, log_rest + estimate)
         estimate = float(logsumexp(above) - np.log(len(proposal)) - logsumexp(below) + np.log(len(posterior)))

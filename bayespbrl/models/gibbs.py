@@ -1,4 +1,4 @@
-"""Gibbs moves over all that is not a weight: the setting of the features, steepness, lapse rates and tie threshold.
+"""Gibbs moves over all unknowns but the weights: the setting of the features, steepness, lapse rates and tie threshold.
 
 Steepness, lapse rates and threshold have a prior on a grid, and given the margins each is drawn exactly from its
 conditional distribution. The setting (length scales) is drawn given the *whitened* weights ξ, z = m + A ξ, with the
@@ -9,13 +9,13 @@ the weights change with it, its probabilities carry the volume |A| (reversible j
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray, Shaped
 
 from bayespbrl.models.likelihoods import Likelihood, Margins, Scalar, Values, WithLapses, WithTies, has_steps, log_prob
 from bayespbrl.models.preference_problem import PreferenceProblem
@@ -33,7 +33,7 @@ class Table(NamedTuple):
 
 
 class JointProblem(NamedTuple):
-    """All that is given.
+    """Data, priors and Gaussian references of the joint model.
 
     Attributes:
       settings: one problem for each of C settings, stacked.
@@ -54,7 +54,7 @@ class JointProblem(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """What is sampled beside the weights: numbers of the setting and of the grids' values."""
+    """The unknowns beside the weights: index of the setting and of each grid's value."""
 
     setting: Int[Array, "*chains"]
     steepness: Int[Array, "*chains"]
@@ -92,17 +92,20 @@ def prior_draws(problem: JointProblem, rng: np.random.Generator, number: int) ->
     ]
 
 
-def at_setting(stacked_parts: Any, setting: Int[Array, ""]) -> Any:
+Parts = TypeVar("Parts")
+
+
+def at_setting(stacked_parts: Parts, setting: Int[Array, ""]) -> Parts:
     """The parts of one setting; without a copy where there is only one."""
     return jax.tree.map(lambda each: each[0] if len(each) == 1 else each[setting], stacked_parts)
 
 
 def conditional(problem: JointProblem, unknowns: Unknowns) -> PreferenceProblem:
-    """The problem of the weights given all else."""
+    """The problem of the weights given all other unknowns."""
     settings = problem.settings
     stacks = {name: getattr(settings, name) for name in STACKED}
     if settings.loadings.shape[1] <= FEW:
-        parts: dict[str, Array] = {name: each[unknowns.setting] for name, each in stacks.items()}
+        parts: dict[str, Shaped[Array, "n ..."]] = {name: each[unknowns.setting] for name, each in stacks.items()}
     else:
         parts = at_setting(stacks, unknowns.setting)
         if not has_steps(settings.likelihood):
@@ -113,7 +116,7 @@ def conditional(problem: JointProblem, unknowns: Unknowns) -> PreferenceProblem:
 
 
 def reference_scale(problem: JointProblem, unknowns: Unknowns) -> Values:
-    """By how much the references are wider under these unknowns than as they were fitted."""
+    """Width of the references under these unknowns, relative to their width when fitted."""
     if problem.fitted_steepness is None:
         return jnp.ones(())
     return jnp.asarray(problem.fitted_steepness / problem.steepness.values[unknowns.steepness])
@@ -122,7 +125,7 @@ def reference_scale(problem: JointProblem, unknowns: Unknowns) -> Values:
 def moved(
     key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem
 ) -> tuple[Float[Array, " q"], Unknowns]:
-    """New weights and unknowns after one move of each kind; what is given has none."""
+    """New weights and unknowns after one move of each kind; fixed parameters have no move."""
     keys = random.split(key, 4)
     if len(problem.log_probabilities) > 1:
         z, unknowns = _setting_move(keys[0], z, unknowns, problem)
@@ -226,7 +229,7 @@ def _likelihood(problem: JointProblem, point: Point) -> Likelihood:
 
 
 def likelihood_with(template: Any, point: Point) -> Any:
-    """The likelihood with other values in it."""
+    """The likelihood with the parameters of `point`."""
     if isinstance(template, WithTies):
         return replace(template, ordered=likelihood_with(template.ordered, point), threshold=point.tie_threshold)
     if isinstance(template, WithLapses):

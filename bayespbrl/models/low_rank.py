@@ -81,7 +81,7 @@ class UtilityWeights(BackendArray):
         self.dtype = np.dtype(np.float64)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Float[np.ndarray, "..."] | np.float64:
-        draws: np.ndarray | np.float64 = indexing.explicit_indexing_adapter(
+        draws: Float[np.ndarray, "*n"] | np.float64 = indexing.explicit_indexing_adapter(
             key, self.shape, indexing.IndexingSupport.OUTER, self._outer
         )
         return draws

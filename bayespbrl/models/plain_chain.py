@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jax import Array, lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
@@ -77,7 +77,9 @@ def plain_draws(
     return posterior_tree(fits, chains, kept, report, attributes, np.asarray(differences), NOTHING_ELSE)
 
 
-def _part(chains: Chains, z: np.ndarray, log_p: np.ndarray, *flags: np.ndarray) -> dict[str, np.ndarray]:
+def _part(
+    chains: Chains, z: Float[np.ndarray, "n q"], log_p: Float[np.ndarray, "n k"], *flags: Shaped[np.ndarray, " n"]
+) -> dict[str, Shaped[np.ndarray, "1 n ..."]]:
     """Draws as `Chains` keeps them, of one chain."""
     named = dict(zip(("candidates", "stuck", "diverging"), flags, strict=True))
     rows = {"coordinates": z[:, : chains.rank], "answers": log_p[:, : chains.number], **named}
@@ -94,15 +96,20 @@ KERNEL = EllipticalSlice(low_rank_model, batch=8, ellipses=_ellipses)
 
 @partial(jax.jit, static_argnames="length")
 def _moves(
-    state: EllipticalSliceState, problem: PreferenceProblem, burn_in: Array, between: Array, *, length: int
-) -> tuple[Float[Array, "n q"], Float[Array, "n k"], Array, Array, Array]:
+    state: EllipticalSliceState,
+    problem: PreferenceProblem,
+    burn_in: Int[Array, ""],
+    between: Int[Array, ""],
+    *,
+    length: int,
+) -> tuple[Float[Array, "n q"], Float[Array, "n k"], Float[Array, " n"], Bool[Array, " n"], Bool[Array, " n"]]:
     """`length` draws after `burn_in` moves, each after `between` more: z, log p of each answer, and the flags."""
 
-    def after(state: EllipticalSliceState, moves: Array) -> EllipticalSliceState:
+    def after(state: EllipticalSliceState, moves: Int[Array, ""]) -> EllipticalSliceState:
         moved: EllipticalSliceState = lax.fori_loop(0, moves, lambda _, now: KERNEL.sample(now, (problem,), {}), state)
         return moved
 
-    def step(state: EllipticalSliceState, _: None) -> tuple[EllipticalSliceState, tuple[Array, ...]]:
+    def step(state: EllipticalSliceState, _: None) -> tuple[EllipticalSliceState, tuple[Shaped[Array, "..."], ...]]:
         state = after(state, between)
         z = state.z["utility_weights"]
         log_p = log_prob(problem.likelihood, problem.loadings @ z)

@@ -184,7 +184,7 @@ def _with_better_references(
 def _diagnosed(
     chains: Chains, length: int, margins: Float[np.ndarray, "chain draw k"]
 ) -> Float[np.ndarray, "chain draw n"]:
-    """What must converge: the margins, all that is inferred beside the weights, and membership in each setting."""
+    """The quantities that must converge: margins, inferred hyperparameters, membership in each setting."""
     settings = chains.collected("setting", length)
     numbers, counts = np.unique(settings, return_counts=True)
     members = [settings == n for n, count in zip(numbers, counts, strict=True) if count >= LEAST_SHARE * settings.size]

@@ -43,7 +43,7 @@ def margins_of(fits: Sequence[GaussianFit], chains: Chains, length: int) -> Floa
 
 
 def fit_attributes(number: int, seed: int, evidence: tuple[float, float]) -> dict[str, float]:
-    """What a tree states of its fit: K of eq. 8, the seed, the log marginal likelihood and its Monte Carlo error."""
+    """The attributes of a fit: K of eq. 8, the seed, the log marginal likelihood and its Monte Carlo error."""
     log_evidence, error = evidence
     return {
         "number_of_preferences": int(number),
@@ -110,7 +110,7 @@ def posterior_tree(
 
 
 def answers_of(tree: xr.DataTree) -> Answers:
-    """What is known of the answers that a tree was fitted to."""
+    """Ties, sides and answerers of the answers that a tree was fitted to."""
     known, drawn = tree.children["constant_data"].dataset, tree.children["posterior"].dataset
     tied = np.asarray(tree.children["observed_data"]["answers"]) == 0
     parts = {name: known[name].values.astype(int) for name in ("shown_first", "answerers") if name in known}

@@ -7,7 +7,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Integer, Shaped
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
@@ -86,7 +86,7 @@ class PreferenceModel:
 
 @dataclass(frozen=True)
 class Answers:
-    """What is known of K answers beside the order that the differences state; None: nothing.
+    """Ties, sides and answerers of K answers; None where they are not known.
 
     Attributes:
       indifferent, shown_first, answerers: as of `sample_posterior`, shape (K,).
@@ -111,10 +111,10 @@ class Answers:
         )
 
     def of(self, rows: ArrayLike) -> "Answers":
-        """Those of some rows; the answerers keep their numbers."""
+        """The answers of some rows; answerers keep their numbers."""
         chosen = np.asarray(rows)
 
-        def some(part: ArrayLike | None) -> np.ndarray | None:
+        def some(part: ArrayLike | None) -> Shaped[np.ndarray, " n"] | None:
             return None if part is None else np.asarray(part)[chosen]
 
         return Answers(some(self.indifferent), some(self.shown_first), some(self.answerers), self.names)
@@ -140,7 +140,9 @@ class Answers:
 NOTHING_ELSE = Answers()
 
 
-def _numbered(who: np.ndarray, names: tuple[str, ...] | None, number: int) -> tuple[np.ndarray, tuple[str, ...]]:
+def _numbered(
+    who: Shaped[np.ndarray, "..."], names: tuple[str, ...] | None, number: int
+) -> tuple[Integer[np.ndarray, " k"], tuple[str, ...]]:
     """The number of each of K answerers, who are given by name or by number, and the names by number."""
     if who.shape == (number,) and number and all(isinstance(each, str) for each in who):
         given = [str(each) for each in who]
@@ -152,7 +154,7 @@ def _numbered(who: np.ndarray, names: tuple[str, ...] | None, number: int) -> tu
     return who, tuple(map(str, range(int(who.max(initial=0)) + 1))) if names is None else names
 
 
-def _numbers(name: str, values: ArrayLike, number: int, least: int, most: int) -> np.ndarray:
+def _numbers(name: str, values: ArrayLike, number: int, least: int, most: int) -> Integer[np.ndarray, " k"]:
     array = np.asarray(values)
     if array.shape != (number,) or array.dtype.kind not in "iu" or np.any((array < least) | (array > most)):
         raise ValueError(f"{name}: expected {number} whole numbers in {least} … {most}, got {values!r}")
@@ -211,7 +213,7 @@ def joint_preference_model(
     by_answerer = answers.by_answerer(settings.shape[1])
     who = np.argmax(by_answerer, axis=0)
 
-    def one_of(name: str, prior: Grid) -> Array:
+    def one_of(name: str, prior: Grid) -> Float[Array, "..."]:
         chosen = numpyro.sample(f"{name}_number", dist.Categorical(jnp.asarray(prior.probabilities)))
         return numpyro.deterministic(name, jnp.asarray(prior.values)[chosen])
 

@@ -1,4 +1,4 @@
-"""Priors of what is inferred beside the weights: steepness, lapse rate and tie threshold, each on a grid.
+"""Priors of the hyperparameters: steepness, lapse rate and tie threshold, each on a grid.
 
 A grid makes each of their conditional distributions a table, from which a Gibbs move draws exactly. The values are the
 medians of cells of equal probability of a continuous prior. All are in units of the margins, whose prior standard
@@ -20,7 +20,7 @@ class Grid(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """Its mean."""
+        """The mean of the prior."""
         return float(self.values @ self.probabilities)
 
 

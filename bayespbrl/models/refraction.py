@@ -100,7 +100,7 @@ def flown(
     there, each = jnp.any(walls.relieved != 0, axis=1) & (squares > 0), jnp.arange(len(heights))
 
     def to_next_wall(now: _Flight) -> _Flight:
-        # t cos s + u sin s is zero where cot s = −u/t: the next wall is that of the largest
+        # Pakman & Paninski (2014): t cos s + u sin s is zero where cot s = −u/t: the next wall is that of the largest
         cotangents = jnp.where(there & (jnp.arange(number) != now.last), -now.speeds / now.margins, -jnp.inf)
         # two reductions, because the compiler makes a slow loop of argmax
         wall = jnp.min(jnp.where(cotangents == jnp.max(cotangents), jnp.arange(number), number - 1))
@@ -112,6 +112,7 @@ def flown(
         speed = now.speeds[wall] * cos - now.margins[wall] * sin
         beyond = now.violated - jnp.sign(speed) * walls.relieved[wall]
         gain = jnp.sum(heights[each, beyond.astype(int)] - heights[each, now.violated.astype(int)])
+        # Afshar & Domke (2015): through with the speed that is left, or reflected where none is
         square = speed**2 + 2 * squares[wall] * gain
         through = square > 0
         after = jnp.where(through, jnp.sign(speed) * jnp.sqrt(jnp.maximum(square, 0)), -speed)

@@ -1,4 +1,4 @@
-"""Hamiltonian dynamics split into a Gaussian's, which are a rotation, and what is left (Shahbaba et al. 2014).
+"""Hamiltonian dynamics split into a Gaussian part, a rotation, and a residual (Shahbaba et al. 2014).
 
 Given many answers the posterior of a smooth likelihood is nearly the Gaussian reference. Whitened by it, a quarter of a
 rotation forgets the start, and the gradient of the small residual is needed only a few times on the way.
@@ -15,7 +15,7 @@ from bayespbrl.models.preference_problem import PreferenceProblem
 
 # Gradients in a quarter of a rotation.
 GRADIENTS = 4
-_State = tuple[Array, Array, Array, Array]
+_State = tuple[Float[Array, " q"], Float[Array, " q"], Float[Array, ""], Float[Array, " q"]]
 
 
 def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProblem) -> Float[Array, " q"]:
@@ -40,6 +40,7 @@ def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProb
 
     def step(now: _State, _: None) -> tuple[_State, None]:
         x, velocity, _value, gradient = now
+        # Shahbaba et al. (2014): half a step by the residual, the Gaussian's rotation, half a step by the residual
         velocity = velocity + angle / 2 * gradient
         x, velocity = x * cos + velocity * sin, velocity * cos - x * sin
         value, gradient = with_gradient(x)

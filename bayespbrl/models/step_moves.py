@@ -1,7 +1,7 @@
 """Moves of weights and lapse rates where the likelihood has steps and there are many answers."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ BESIDE = 1e-300  # a margin on one side of the step
 
 
 class Steps(NamedTuple):
-    """What the moves need beside the joint problem.
+    """Precomputed parts of the moves, beside the joint problem.
 
     Attributes:
       walls: of each setting, stacked.
@@ -140,5 +140,8 @@ def _heights(problem: JointProblem) -> Float[Array, "a n"]:
     return logsumexp(log_p, axis=-1)
 
 
-def _stacked(parts: Sequence[Any]) -> Any:
+Parts = TypeVar("Parts")
+
+
+def _stacked(parts: Sequence[Parts]) -> Parts:
     return jax.tree.map(lambda *arrays: jnp.stack(arrays), *parts)

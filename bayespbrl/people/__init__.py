@@ -1,1 +1,1 @@
-"""People answer: one front end on a page and in a notebook, clips of the trajectories, and nobody waits."""
+"""People answer: one front end on a page and in a notebook, clips, and computation ahead of the answers."""

@@ -5,11 +5,10 @@ The colours are readable on light and on dark.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from gymnasium import Env
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 
@@ -49,20 +48,21 @@ def arc(angle: float, length: float, start: tuple[float, float] = (0.0, 0.0)) ->
     return [start, (start[0] + length * np.sin(angle), start[1] + length * np.cos(angle))]
 
 
-Scene = Callable[[Any], list[Stroke]]
+Observation = Shaped[np.ndarray, "..."]
+Scene = Callable[[Observation], list[Stroke]]
 
 
-def limbs(pose: Callable[[Any], Sequence[np.ndarray]]) -> Scene:
+def limbs(pose: Callable[[Observation], Sequence[np.ndarray]]) -> Scene:
     """The scene of polylines, as the `pose` of the dynamics has them."""
 
-    def scene(observation: Any) -> list[Stroke]:
+    def scene(observation: Observation) -> list[Stroke]:
         colours = (BLUE, ORANGE)
         return [Stroke(points, colours[k % 2], 0.1, 0.075) for k, points in enumerate(pose(observation))]
 
     return scene
 
 
-def _cart_pole(observation: Any) -> list[Stroke]:
+def _cart_pole(observation: Observation) -> list[Stroke]:
     x, angle = float(observation[0]) / 2.6, float(observation[2])
     return [
         line((-1, -0.5), (1, -0.5), colour=FAINT, width=0.02),
@@ -71,12 +71,12 @@ def _cart_pole(observation: Any) -> list[Stroke]:
     ]
 
 
-def _pendulum(observation: Any) -> list[Stroke]:
+def _pendulum(observation: Observation) -> list[Stroke]:
     angle = float(np.arctan2(observation[1], observation[0]))  # counter-clockwise
     return [line(*arc(-angle, 0.85), width=0.12, dot=0.08)]
 
 
-def _acrobot(observation: Any) -> list[Stroke]:
+def _acrobot(observation: Observation) -> list[Stroke]:
     first = float(np.arctan2(observation[1], observation[0]))
     both = first + float(np.arctan2(observation[3], observation[2]))
     elbow = (0.45 * np.sin(first), -0.45 * np.cos(first))
@@ -85,8 +85,8 @@ def _acrobot(observation: Any) -> list[Stroke]:
     return [goal, line((0, 0), elbow, dot=0.06), line(elbow, tip, colour=ORANGE, dot=0.06)]
 
 
-def _mountain_car(observation: Any) -> list[Stroke]:
-    def place(x: Any) -> np.ndarray:
+def _mountain_car(observation: Observation) -> list[Stroke]:
+    def place(x: ArrayLike) -> np.ndarray:
         return np.stack([(np.asarray(x) + 0.3) / 0.95, 0.55 * np.sin(3 * np.asarray(x))], axis=-1)
 
     hill = Stroke(place(np.linspace(-1.2, 0.6, 60)), GREY, 0.03)
@@ -96,7 +96,7 @@ def _mountain_car(observation: Any) -> list[Stroke]:
     return [hill, flag, line((x, y + 0.08), (x, y + 0.08), dot=0.09)]
 
 
-def _bicycle(observation: Any) -> list[Stroke]:
+def _bicycle(observation: Observation) -> list[Stroke]:
     steering, lean = float(observation[0]), 3 * float(observation[2])  # the lean is magnified three times
     foot, limit = (0.0, -0.8), 3 * FALL_ANGLE
     top = np.array(arc(lean, 1.4, foot)[1])
@@ -109,7 +109,7 @@ def _bicycle(observation: Any) -> list[Stroke]:
     ]
 
 
-def _double_pendulum(observation: Any) -> list[Stroke]:
+def _double_pendulum(observation: Observation) -> list[Stroke]:
     return [line((-1, 0.5), (1, 0.5), colour=GREEN, width=0.015), *limbs(acrobot.DYNAMICS.pose)(observation)]
 
 
@@ -126,7 +126,7 @@ SCENES: dict[str, Scene] = {
 
 
 def scene_of(environment: Env) -> Scene | None:
-    """How an observation of the environment is drawn; None where we do not know it."""
+    """How an observation of the environment is drawn; None where no drawing is known."""
     name = environment.spec.id if environment.spec is not None else ""
     if name in SCENES:
         return SCENES[name]

@@ -1,4 +1,4 @@
-"""What follows each likely answer, computed before it is given: the questions after it and their clips.
+"""The questions after each likely answer and their clips, computed before the answer is given.
 
 A learner's state never changes and each event follows from it alone, so what is computed early is what would be
 computed late, bit for bit. Nothing reaches the log before the answer does.
@@ -42,7 +42,7 @@ class Moment:
 
     @property
     def unseen(self) -> Query | None:
-        """A question that somebody is to look at and that is not drawn yet; None where there is none."""
+        """A question due to be shown that is not drawn yet; None if all are."""
         return next((q for q in self.state.open if q.number in self.holders and q.number not in self.shown), None)
 
     @property
@@ -129,7 +129,7 @@ class Foresight:
         return self.present
 
     def gather(self, people: Sequence[str | None]) -> None:
-        """From now on these people are here. The questions of others can be taken."""
+        """Set who is present; questions of the others can be taken."""
         if self.people != (now := tuple(people)):
             self.people = now
             if not self.present.failed:
@@ -159,7 +159,7 @@ class Foresight:
         return holders
 
     def _left(self, moment: Moment) -> float:
-        """Answers of the budget."""
+        """Number of answers left in the budget."""
         return self.cycle.settings.questions.left(moment.state.preferences.answers)
 
     def _ahead(self) -> Iterator[Moment]:

@@ -191,7 +191,7 @@ class Page:
 
 
 def seat_of(request: Request) -> Seat:
-    """Whose address was asked."""
+    """The seat whose address was requested."""
     seat = request.scope["seat"]
     assert isinstance(seat, Seat)
     return seat

@@ -1,10 +1,10 @@
-"""Plots of observations over time with a line that moves, for environments that nobody can draw.
+"""Plots of observations over time with a line that moves, for environments without a drawing.
 
 An environment, or its dynamics, may have `observation_names`, one for each entry of an observation.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import gymnasium
 import numpy as np
@@ -15,6 +15,10 @@ from bayespbrl.envs.opening import environment_attribute
 from bayespbrl.figures import new_figure, pixels
 from bayespbrl.people.drawing import BLUE, GREY, ORANGE
 from bayespbrl.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MOST_PANELS = 6  # more entries are one picture, a row each
 INCHES, DPI = (4.4, 4.0), 100
@@ -71,7 +75,7 @@ def _film(
     return pictures
 
 
-def _panels(figure: Any, table: np.ndarray, limits: np.ndarray, names: Sequence[str]) -> list[Any]:
+def _panels(figure: "Figure", table: np.ndarray, limits: np.ndarray, names: Sequence[str]) -> list["Axes"]:
     """A line for each entry, one above the other."""
     panels = list(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
     for axes, values, (low, high), name in zip(panels, table.T, limits, names, strict=True):
@@ -83,7 +87,7 @@ def _panels(figure: Any, table: np.ndarray, limits: np.ndarray, names: Sequence[
     return panels
 
 
-def _rows(figure: Any, table: np.ndarray, limits: np.ndarray, names: Sequence[str]) -> Any:
+def _rows(figure: "Figure", table: np.ndarray, limits: np.ndarray, names: Sequence[str]) -> "Axes":
     """A row of colours for each entry, each between its limits."""
     axes = figure.subplots()
     low, high = limits.T
@@ -94,7 +98,7 @@ def _rows(figure: Any, table: np.ndarray, limits: np.ndarray, names: Sequence[st
     return axes
 
 
-def _quiet(axes: Any) -> None:
+def _quiet(axes: "Axes") -> None:
     axes.patch.set_alpha(0.0)
     axes.tick_params(colors=INK, labelsize=8)
     for side, spine in axes.spines.items():

@@ -1,4 +1,4 @@
-"""What comes before a person's first question: instructions, and practice questions whose answers are not kept."""
+"""Before a person's first question: instructions, and practice questions whose answers are not kept."""
 
 from itertools import combinations
 

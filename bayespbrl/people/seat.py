@@ -17,12 +17,12 @@ class Stale(ValueError):
 
 
 class Sitting(Protocol):
-    """What a person asks of the session of all (`people.session`)."""
+    """The session (`people.session`) as a person's seat sees it."""
 
     changed: threading.Condition
 
     def gather(self) -> None:
-        """See who is here."""
+        """Update who is present."""
         ...
 
     def take(self, seat: "Seat", turn: int, answer: str, seconds: float | None) -> None:

@@ -1,4 +1,4 @@
-"""One sitting: a learner, the person or people who answer, and a thread that thinks.
+"""One sitting: a learner, the people who answer, and a thread that computes.
 
 A turn is one state of the run as one person sees it, and takes one answer or one undo: question → answer → thinking →
 question. The answer is in the log, flushed, before `answer` returns. While people look, the thread computes what
@@ -94,7 +94,7 @@ class Session:
         self._thread = threading.Thread(target=self._think, name="bayespbrl-session", daemon=True)
 
     def open(self) -> "Session":
-        """Start to think; returns the session."""
+        """Start the computing thread; returns the session."""
         with self.changed:
             self._settle()
         self._thread.start()
@@ -110,7 +110,7 @@ class Session:
 
     @property
     def view(self) -> View:
-        """What the first or only person is shown."""
+        """The view of the first or only person."""
         return self.seats[0].view
 
     @property
@@ -224,7 +224,7 @@ class Session:
                 seat.set(self._described(seat, FAILED) | {"say": f"Stopped: {reason} Your answers are kept."})
 
     def _settle(self) -> None:
-        """Bring the views up to date with the present moment, and the thread to work."""
+        """Update all views to the present moment, and wake the thread."""
         if self._foresight.present.failed:
             return
         for seat in self.seats:
@@ -258,7 +258,7 @@ class Session:
         return introduction
 
     def _done(self, moment: Moment) -> bool:
-        """Whether nobody is asked after this moment."""
+        """Whether no question follows this moment."""
         state, most = moment.state, self.most_answers
         given = state.preferences.answers - self._before
         return moment.complete and (state.finished(self.learner.settings) or (most is not None and given >= most))

@@ -1,4 +1,4 @@
-"""What a view says of a turn, as plain data for the page and the widget."""
+"""The contents of a view, as plain data for the page and the widget."""
 
 import re
 from collections.abc import Mapping

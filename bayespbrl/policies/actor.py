@@ -1,4 +1,4 @@
-"""A policy put to work: one observation in, one action for the environment out."""
+"""A policy acting in an environment: one observation in, one action out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -42,8 +42,8 @@ class Actor:
     __call__ = act
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[Any, Any]:
+        self, observation: Any, state: object = None, episode_start: object = None, deterministic: bool = False
+    ) -> tuple[Any, object]:
         """Action and `state`, for one observation or a batch of them, as stable-baselines3's policies give.
 
         Args:
@@ -69,7 +69,7 @@ class Actor:
         if not is_discrete(policy):
             raise ValueError(f"deterministic: expected a policy with a method mode, got {type(policy).__name__}")
         rows = np.asarray(self.observe(observation))[None]
-        return int(self.enact(int(np.argmax(policy.probabilities(rows)[0]))))  # type: ignore[union-attr]
+        return int(self.enact(int(np.argmax(policy.probabilities(rows)[0]))))
 
     def _drawn(self, policy: Sampler, observation: Any, key: Key[Array, ""] | None = None) -> Any:
         if key is None:

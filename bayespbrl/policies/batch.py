@@ -60,7 +60,7 @@ def entropies(policy: Policy, observations: ArrayLike) -> Float[np.ndarray, " n"
         return _in_chunks(lambda _, rows: _entropy_chunk(policy, rows), observations)
 
 
-def _in_chunks(function: Callable[..., Array], *given: ArrayLike) -> Shaped[np.ndarray, "n ..."]:
+def _in_chunks(function: Callable[..., Shaped[Array, "n ..."]], *given: ArrayLike) -> Shaped[np.ndarray, "n ..."]:
     """`function(start, *rows)` of CHUNK rows of `given` at a time; the last chunk repeats the last row."""
     arrays = [np.asarray(a) for a in given]
     number = len(arrays[0])

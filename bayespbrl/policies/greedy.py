@@ -1,13 +1,12 @@
-"""A policy without its noise, which explores nothing: what a run keeps and is judged by."""
+"""A policy without its exploration noise: the form in which a run keeps and evaluates policies."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 from jax import Array
 from jaxtyping import Key, Shaped
 
-from bayespbrl.policies.policy import AnyArray
+from bayespbrl.policies.policy import AnyArray, Sampler, WithMode, has_mode
 
 
 @jax.tree_util.register_dataclass
@@ -19,14 +18,13 @@ class Greedy:
       policy: stochastic, with a `mode`.
     """
 
-    policy: Any
+    policy: WithMode
 
     def sample(self, key: Key[Array, ""], observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
         """argmaxₐ π(a|s), whatever the key."""
-        action: Array = self.policy.mode(observation)
-        return action
+        return self.policy.mode(observation)
 
 
-def greedy(policy: Any) -> Any:
+def greedy(policy: Sampler) -> Sampler:
     """`policy` without its noise; itself where it is one of the user's that has no `mode`."""
-    return Greedy(policy) if callable(getattr(type(policy), "mode", None)) else policy
+    return Greedy(policy) if has_mode(policy) else policy

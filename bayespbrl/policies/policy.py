@@ -1,6 +1,6 @@
-"""What the learner asks of a stochastic policy π(a|s) (paper, preliminaries and eq. 14)."""
+"""The protocol of a stochastic policy π(a|s) (paper, preliminaries and eq. 14)."""
 
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, TypeGuard, runtime_checkable
 
 import numpy as np
 from gymnasium import Space
@@ -12,7 +12,7 @@ AnyArray = Array | np.ndarray  # a policy holds NumPy's arrays, within a trace J
 
 
 class Sampler(Protocol):
-    """What a rollout needs of a policy."""
+    """The part of a policy that a rollout needs."""
 
     def sample(self, key: Key[Array, ""], observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
         """One action for one observation. Continuous actions are not clipped: the environment does that."""
@@ -72,6 +72,35 @@ class Policy(Sampler, Protocol):
         ...
 
 
-def is_discrete(policy: object) -> bool:
+class DiscretePolicy(Policy, Protocol):
+    """A policy whose actions can be enumerated."""
+
+    def probabilities(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
+        """π(·|sᵢ) at each of N observations."""
+        ...
+
+
+class ContinuousPolicy(Policy, Protocol):
+    """A policy over vectors of actions."""
+
+    def action_standard_deviation(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
+        """Of each dimension of the action at each of N observations."""
+        ...
+
+
+class WithMode(Sampler, Protocol):
+    """A policy that knows its most probable action."""
+
+    def mode(self, observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:
+        """argmaxₐ π(a|s)."""
+        ...
+
+
+def has_mode(policy: object) -> TypeGuard[WithMode]:
+    """Whether a policy knows its most probable action; one of the user's may not."""
+    return callable(getattr(type(policy), "mode", None))
+
+
+def is_discrete(policy: object) -> TypeGuard[DiscretePolicy]:
     """Whether a policy's actions can be enumerated."""
     return hasattr(policy, "probabilities")

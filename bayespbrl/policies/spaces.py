@@ -1,4 +1,4 @@
-"""What an observation or action space says: the number of values, or the dimension, centre and range; its bounds."""
+"""Properties of observation and action spaces: number of values, dimension, centre, range and bounds."""
 
 from typing import Any
 

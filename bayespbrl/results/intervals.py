@@ -66,7 +66,7 @@ def failed_trials(failed: int, trials: int) -> Interval:
 
 
 def answers_for_good(answers: np.ndarray, values: np.ndarray, level: float, quantile: float = 0.5) -> Interval:
-    """Answers from which on a quantile over the trials is at least `level`, for good: it never falls below again.
+    """Number of answers after which a quantile over the trials stays at or above `level`.
 
     Args:
       answers: numbers of answers, shape (n,), increasing.
@@ -91,7 +91,7 @@ def answers_for_good(answers: np.ndarray, values: np.ndarray, level: float, quan
 
 
 def holm(p: Sequence[float]) -> np.ndarray:
-    """p values adjusted for their number, controlling the family-wise error rate (Holm 1979), in their order."""
+    """p values adjusted to control the family-wise error rate (Holm 1979), in the given order."""
     values = np.asarray(p, dtype=np.float64)
     order = np.argsort(values, kind="stable")
     adjusted = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1.0)
@@ -101,7 +101,7 @@ def holm(p: Sequence[float]) -> np.ndarray:
 
 
 def benjamini_hochberg(p: Sequence[float]) -> np.ndarray:
-    """p values adjusted for their number, controlling the false discovery rate (Benjamini & Hochberg 1995)."""
+    """p values adjusted to control the false discovery rate (Benjamini & Hochberg 1995)."""
     return np.asarray(stats.false_discovery_control(np.asarray(p, dtype=np.float64))) if len(p) else np.empty(0)
 
 

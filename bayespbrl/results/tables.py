@@ -1,4 +1,4 @@
-"""The tables of a study: values with their intervals, what the runs were like, calibration of the predicted answers."""
+"""The tables of a study: values with their intervals, settings and convergence of runs, calibration of predictions."""
 
 from collections.abc import Callable
 
@@ -26,7 +26,7 @@ MISSING = "–"
 
 
 def values_table(data: StudyData) -> pd.DataFrame:
-    """A line for each row: what the trials end at, and how they differ from the first row of their task.
+    """Final value of each row, and its difference from the first row of the same task.
 
     All comparisons are at the same number of answers on both sides, over shared seeds, and their p values are adjusted
     for the number of comparisons in the table (Holm); `false discovery` has Benjamini and Hochberg's.
@@ -121,7 +121,7 @@ def _bounds(interval: Interval, form: str = "{:.4g}") -> str:
 
 
 def runs_table(data: StudyData) -> pd.DataFrame:
-    """A line for each row: the settings, and whether its fits and updates can be believed."""
+    """Settings and convergence of each row."""
     lines = []
     for row in data.rows:
         if row.declared.untrained or row.declared.baseline is not None:
@@ -148,7 +148,7 @@ def runs_table(data: StudyData) -> pd.DataFrame:
 
 
 def kept_table(data: StudyData) -> pd.DataFrame:
-    """A line for each row: its kept policies beside the newest and the best of each run; none where all are the newest.
+    """Values of each row's kept, newest and best policies; no lines where all kept ones are the newest.
 
     The best is by the hidden value, which only the evaluation knows.
     """
@@ -180,7 +180,7 @@ def _of(value: float, form: str) -> str:
 
 
 def calibration_table(data: StudyData) -> pd.DataFrame:
-    """A line for each row with a posterior: how well it predicted its answers before they were given.
+    """Calibration of each row with a posterior: predictions of its answers before they were given.
 
     `z` is the log score less its expectation under the predictions themselves, in standard deviations: below −2 the
     predictions are overconfident. The first iteration, which has no posterior, is left out.

@@ -36,14 +36,14 @@ def refreshed(directory: Path) -> StudyData:
 
 
 def tables_of(data: StudyData) -> dict[str, pd.DataFrame]:
-    """The tables of a study by name, without those that have no line."""
+    """The non-empty tables of a study, by name."""
     makers = {"values": values_table, "kept": kept_table, "calibration": calibration_table, "runs": runs_table}
     tables = {name: make(data) for name, make in makers.items()}
     return {name: table for name, table in tables.items() if len(table)}
 
 
 def section(data: StudyData, name: str, table: pd.DataFrame) -> str:
-    """A table in Markdown with its source, and what its columns are."""
+    """A table in Markdown, with its source and the meaning of its columns."""
     notes = {
         "values": f"Value of the kept policy at the end of a trial. Relative value: 0 is the random policy, 1 the "
         f"median of the reference runs on the hidden reward. Differences: median paired difference to the first row of "

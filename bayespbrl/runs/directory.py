@@ -202,11 +202,11 @@ class RunDirectory:
 
 
 class PartialLine(ValueError):
-    """The last line of a log without its end, as a process killed while writing leaves it."""
+    """An incomplete last line of a log, left by a process that was killed while writing."""
 
 
 def read_log_lines(file: Path) -> list[Event | ValueError]:
-    """Each line of a log: an event, or an error that says which line is none. A missing log has no lines."""
+    """Each line of a log: an event, or an error with its line number. A missing log has no lines."""
     if not file.exists():
         return []
     *lines, rest = file.read_bytes().split(b"\n")

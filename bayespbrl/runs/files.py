@@ -1,4 +1,4 @@
-"""Files that are on the disk whole or not at all: written aside, flushed, renamed into place."""
+"""Atomic files: written aside, flushed, renamed into place."""
 
 import os
 import threading

@@ -1,4 +1,4 @@
-"""Who continues a run: one process at a time."""
+"""A lock on a run: one process continues it at a time."""
 
 import os
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ except ImportError:  # Windows, where the log's own check has to do
 
 @contextmanager
 def continuing(directory: Path | str) -> Iterator[None]:
-    """Hold a run directory. The system lets go of it when the process ends, however that is.
+    """Lock a run directory. The system releases the lock when the process ends, for whatever reason.
 
     Raises:
       ValueError: another process continues the run, or the directory is no run.

@@ -108,7 +108,7 @@ def _check_import(log: RunDirectory, env: AnyEnvironment | None, permitted: bool
 
 
 def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Learner:
-    """The learner by the log of a run; `own` are the user's objects by the names of their options."""
+    """The learner rebuilt from the log of a run; `own` holds the user's objects, by option name."""
     settings = log.settings
     for name, given in own.items():
         if (settings.options()[name] == "other") != (given is not None):
@@ -191,7 +191,7 @@ class Run:
         return None if self.estimate is None else self.estimate.posterior
 
     def estimate_without(self, answerer: str) -> UtilityEstimate:
-        """The utility inferred again from the answers of all others; the run is not changed.
+        """The utility inferred without one person's answers; the run is not changed.
 
         Raises:
           ValueError: a name that nobody who answered has.

@@ -13,7 +13,7 @@ DRAWS = 200  # for the standard deviation: known to a twentieth
 
 
 class UtilityReward(gymnasium.Wrapper):
-    """`env` whose reward is the utility of the state that a step leads to, as the answers are explained.
+    """`env` with the inferred utility of the next state as its reward.
 
     `info` of each step has `true_reward`, the environment's own, and `utility_deviation`, the posterior standard
     deviation of the utility there. A policy that learns from this reward tells whether the utility or the policy of a

@@ -1,4 +1,4 @@
-"""What a run was asked to do: the options of a learner, composed of those of its parts.
+"""The options of a run, composed of those of its parts.
 
 Users name an option alone: in keywords, on the command line, in `settings.json`. `OPTIONS` tells which part reads it.
 """
@@ -59,12 +59,12 @@ class Features:
 
     @property
     def of_critic(self) -> RadialBasisOptions:
-        """Those of Q and V."""
+        """The features of Q and V."""
         return RadialBasisOptions(self.centres, self.bandwidth_factor)
 
     @property
     def of_utility(self) -> RadialBasisOptions:
-        """Those of the utility."""
+        """The features of the utility."""
         return RadialBasisOptions(
             self.centres,
             self.utility_bandwidth_factor,
@@ -148,7 +148,7 @@ class Settings:
         self._check_together()
 
     def _check_together(self) -> None:
-        """What one part's option asks of another part's."""
+        """Check options that depend on options of another part."""
         utility, query, schedule = self.estimation.utility, self.questions.query, self.update.schedule
         checks.one_of("schedule", schedule, (*SCHEDULES, "other"))
         if utility in WITHOUT_POSTERIOR and query not in ("highest-utility", "other"):
@@ -195,11 +195,11 @@ class Settings:
 
     @property
     def _restarted(self) -> int:
-        """Iterations of the policy that is started anew."""
+        """Number of iterations of the restarted policy."""
         return self.update.restart_iterations if self.update.checked and self.iterations is None else 0
 
     def restarts(self, iteration: int, answers: int, unasked: int) -> bool:
-        """Whether the policy is started anew, because the answers have said what they can; arguments as of `finished`.
+        """Whether to restart the policy: answers or iterations are used up, or no question is worthwhile.
 
         Decision: at once after the last answer, since nobody is asked about what the first policy does then, but not
         before it had as many iterations as a run without a second policy ends with.
@@ -210,7 +210,7 @@ class Settings:
         return answers >= budget or unasked >= MOST_UNASKED or iteration >= self.most_iterations - self._restarted
 
     def last_iteration(self, started: int = 0) -> int:
-        """After which a run ends in any case; `started` as of `finished`."""
+        """The last iteration that a run can have; `started` as of `finished`."""
         return min(self.most_iterations, started + self._restarted) if started else self.most_iterations
 
     def finished(self, iteration: int, answers: int, unasked: int, started: int = 0) -> bool:

@@ -177,7 +177,7 @@ def _axis(where: str, axis: str, content: Mapping[str, Any]) -> dict[str, Option
     return dict(levels) or {"": {}}
 
 
-def _table(where: str, value: Any) -> dict[str, Any]:
+def _table(where: str, value: object) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"{where}: expected a table, got {value!r}")
     return value

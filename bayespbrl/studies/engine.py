@@ -31,7 +31,7 @@ class Failure:
 
 @dataclass
 class Progress:
-    """Where a study stands: numbers of trials, and the seconds since it was begun or continued.
+    """The progress of a study: numbers of trials, and seconds since it was begun or continued.
 
     Attributes:
       total: trials of the study, those to come in place of redrawn ones among them.
@@ -139,7 +139,7 @@ class Engine:
 
 
 def _died(error: BaseException) -> bool:
-    """Whether a trial's process ended before its trial: it may be started again."""
+    """Whether a trial's process died before its trial ended; the trial may be started again."""
     # of Dask's, which need not be installed
     names = {kind.__name__ for kind in type(error).__mro__}
     return isinstance(error, BrokenExecutor | CancelledError | MemoryError) or bool(

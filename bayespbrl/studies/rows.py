@@ -35,7 +35,7 @@ MOST_SEEDS_A_TRIAL = 10  # a study gives up after so many seeds per trial: prefe
 
 @dataclass(frozen=True)
 class Row:
-    """What all trials of a row share: plain data, since it is sent to other processes.
+    """The options that all trials of a row share: plain data, since it is sent to other processes.
 
     Attributes:
       env: a short name or a gymnasium id.

@@ -1,4 +1,4 @@
-"""A declared study on disk: one run directory for each of its cells, a copy of what was declared, one table of all.
+"""A declared study on disk: a run directory for each cell, a copy of the declaration, one table.
 
 study.toml          the declaration
 study.json          study, version, command, machine, date
@@ -97,16 +97,16 @@ class Study:
 
     @property
     def cells(self) -> int:
-        """Trials in all."""
+        """Number of trials in all."""
         return self.trials * len(self.rows)
 
     @property
     def finished(self) -> int:
-        """Cells that are finished."""
+        """Number of finished cells."""
         return sum(len(row.with_outcome(True)) for row in self.rows)
 
     def minutes_left(self) -> float | None:
-        """Minutes on one core for what is not finished; None where a row has no finished trial and declares nothing.
+        """Estimated minutes on one core for the unfinished cells; None without a finished or declared time.
 
         By the row's finished trials, else as declared.
         """
@@ -128,7 +128,7 @@ class Study:
         command: str = "",
         progress: Callable[[Progress], None] | None = None,
     ) -> list[Failure]:
-        """Run what is not finished, and write the tables.
+        """Run the unfinished cells, and write the tables.
 
         Args:
           jobs: trials at a time, in processes of this machine; or an executor, whose workers see the same directory.
@@ -211,7 +211,7 @@ def _check_same(declaration: Declaration, directory: Path) -> None:
 
 
 def _settled(declaration: Declaration) -> tuple[Any, ...]:
-    """What may not change between two calls of a study."""
+    """The parts of a declaration that may not change between two calls."""
     rows = [(row.levels, row.env, dict(row.options), row.untrained, row.baseline) for row in declaration.rows]
     return declaration.seed, rows
 

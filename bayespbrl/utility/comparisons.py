@@ -1,4 +1,4 @@
-"""What was compared: the data of step 1, as differences of features (paper, eq. 5)."""
+"""The comparisons, the data of step 1, as differences of features (paper, eq. 5)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

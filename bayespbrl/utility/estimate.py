@@ -1,4 +1,4 @@
-"""What the other steps ask of a utility estimate: the protocol of its kinds."""
+"""The protocol of a utility estimate, used by the other steps."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, Protocol, Self
@@ -22,7 +22,7 @@ class UtilityEstimate(Protocol):
 
     @property
     def quality(self) -> FitQuality:
-        """How far the estimate can be trusted."""
+        """Convergence of the estimate, and its fit to the answers."""
         ...
 
     @property
@@ -45,7 +45,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def hyperparameters(self) -> dict[str, Any] | None:
-        """What was inferred beside the weights, as plain data; None where nothing was."""
+        """The inferred hyperparameters as plain data; None where there are none."""
         ...
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:

@@ -1,4 +1,4 @@
-"""The posterior of the utility over everything that is unknown, and the utility that is acted on (paper, eqs. 7-8)."""
+"""The posterior of the utility over all unknowns, and the utility that the learner acts on (paper, eqs. 7-8)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""How far an estimate of the utility can be trusted: its convergence and its fit to the answers."""
+"""The quality of a utility estimate: its convergence and its fit to the answers."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class FitQuality:
-    """How far an estimate can be trusted.
+    """Convergence of an estimate, and its fit to the answers.
 
     Attributes:
       converged: R̂ and effective sample size, or the linear program's status, are in order.

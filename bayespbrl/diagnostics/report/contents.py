@@ -1,4 +1,4 @@
-"""What can be read of a run directory, whether the run is finished, in progress or damaged.
+"""The readable contents of a run directory: finished, in progress or damaged.
 
 A file that cannot be read costs only its own contents.
 """
@@ -78,7 +78,7 @@ class RunContents:
 
     @property
     def compared(self) -> Mapping[int, Trajectory]:
-        """What questions are about, by number: the trajectories that can be read, or a part of each."""
+        """The compared trajectories that can be read, or the compared part of each, by number."""
         if not self.clips:
             return self.trajectories
         return {n: one.clip(*self.clips[n]) for n, one in self.trajectories.items() if n < len(self.clips)}
@@ -117,7 +117,7 @@ def read_contents(
     features: StateFeatures | None = None,
     import_package: bool = False,
 ) -> RunContents:
-    """Read all that can be read of a run directory, and change nothing.
+    """Read the readable contents of a run directory, and change nothing.
 
     Args:
       directory: of a run, finished or not, complete or not.
@@ -218,7 +218,7 @@ def _check_fitting(contents: RunContents, parts: Mapping[str, Any], features: St
 
 
 def _features_failure(estimate: UtilityEstimate, features: StateFeatures | None, trajectory: Trajectory) -> str:
-    """What is wrong with features that were passed; empty if nothing."""
+    """The reason why the passed features cannot be used; empty if they can."""
     if features is None or estimate.features is None:
         return ""
     try:

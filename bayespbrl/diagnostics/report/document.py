@@ -77,7 +77,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """All that the templates name."""
+    """The variables of the templates."""
 
     title: str
     state: str

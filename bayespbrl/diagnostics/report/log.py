@@ -1,4 +1,4 @@
-"""What can be read of the log of a run: the learner's state without its heavy parts, the answers, the summaries.
+"""The readable part of a run's log: the learner's state without its heavy parts, answers, summaries.
 
 The events are applied as the learner applies them. Where one cannot be applied, those before it count, and a warning
 says why.

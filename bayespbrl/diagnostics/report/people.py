@@ -1,4 +1,4 @@
-"""The section of a report on those who answered, and what to do about each."""
+"""The section of a report on the people who answered."""
 
 from collections.abc import Iterator
 
@@ -24,7 +24,7 @@ def has_people(contents: RunContents) -> bool:
 
 
 def people_section(contents: RunContents) -> Body:
-    """The figures of each person, and a sentence on whoever needs one."""
+    """The figures of each person, and the warnings about them."""
     table = _table(contents)
     head = ["person", "answers", "ties", "cannot tell", "lapse rate", "side bias", "same on repeats", "median time"]
     given = contents.model.lapse_rate is not None
@@ -35,11 +35,11 @@ def people_section(contents: RunContents) -> Body:
         "repeats: how many repeated questions were answered as before, with the exact interval of the share."
     )
     text = [f"{warning.what} {warning.remedy}" for warning in people_warnings(contents)]
-    return text or ["Nothing about anyone's answers asks for action."], [Table(caption, head, rows)]
+    return text or ["No warnings about any person."], [Table(caption, head, rows)]
 
 
 def people_warnings(contents: RunContents) -> list[ReportWarning]:
-    """What to do about whom."""
+    """The warnings about each person, with their remedies."""
     table = _table(contents)
     several = table.sizes["answerer"] > 1
     return [

@@ -57,8 +57,8 @@ def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
         caption = (
             "Mean utility of each iteration's trajectories by the last estimate, relative to the last iteration's; the "
             "scale is arbitrary. No reward enters, so this is the learning curve of a run with a person's answers. "
-            "Where the interval is below zero, the policy has become better since, by this utility. Where it is flat "
-            "and contains zero, nothing more was gained. Whether the gain is real, the trajectories show."
+            "An interval below zero: the policy has improved since, by this utility. A flat curve whose interval "
+            "contains zero: no further gain. Only the trajectories show whether the gain is real."
         )
         if contents.started:
             caption += (
@@ -106,7 +106,7 @@ def _rank_plots(tree: xr.DataTree, result: xr.Dataset) -> Picture:
 
 
 def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
-    """Whether the predicted probabilities of answers can be trusted."""
+    """Calibration of the predicted probabilities of answers."""
     if contents.without_posterior:
         return [contents.posterior_missing], []
     total = scores.sizes["prediction"]

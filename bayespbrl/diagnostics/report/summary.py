@@ -52,7 +52,7 @@ def _value(contents: RunContents, iterations: xr.Dataset) -> str:
 
 
 def _restart(contents: RunContents) -> Iterator[str]:
-    """Since when a policy that was started anew is updated, and which one the run keeps."""
+    """When the policy was restarted, and which policy the run keeps."""
     kept = contents.iterations[-1].get("kept")
     if contents.started and isinstance(kept, int):
         of = "the one" if kept > contents.started else "the earlier one"

@@ -49,7 +49,7 @@ def iterations_without_question(contents: RunContents, iterations: xr.Dataset) -
 
 
 def answers_table(contents: RunContents) -> xr.Dataset:
-    """Every answer, along `answer`, with its probabilities.
+    """All answers, along `answer`, with their probabilities.
 
     Returns:
       `question`, `iteration`, `first`, `second`, `said`, the answer; `before`, its probability by the estimate that the

@@ -44,7 +44,7 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
     if ranking.sizes["trajectory"] > 1:
         caption = (
             "Probability of each rank of the newest trajectories and the undominated one; rank 1 is the best. A sharp "
-            "diagonal is a certain order; a column of one shade is an unknown one."
+            "diagonal: the order is well determined. A uniform column: the rank is unknown."
         )
         alt = f"Probabilities of the ranks of {ranking.sizes['trajectory']} trajectories."
         panels = [("Ranking", partial(plot_ranking, ranking))]
@@ -53,7 +53,7 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
 
 
 def _what_else(found: Mapping[str, Any], settings: int) -> str:
-    """What the posterior over `settings` choices of length scales says of all but the weights, in words."""
+    """What the posterior over `settings` choices of length scales says about all but the weights, in words."""
 
     def inferred(name: str) -> str:
         low, high = (found[f"{name} {end}"] for end in ("lower", "upper"))
@@ -111,8 +111,8 @@ def _maps(table: xr.Dataset) -> list[Picture]:
         shown.append(("left", "Remaining uncertainty", "sd / prior sd", "magma"))
         caption = (
             f"The utility {where}: its posterior mean; its standard deviation, which is also small where the features "
-            "are small; and the standard deviation as a share of the prior's, dark where something was learnt. The "
-            "scale is arbitrary."
+            "are small; and the standard deviation as a share of the prior's, dark where the answers were informative. "
+            "The scale is arbitrary."
         )
         if not np.array_equal(table["used"], table["mean"]):
             shown.append(used)
@@ -135,6 +135,6 @@ def _draws(table: xr.Dataset, blank: np.ndarray, where: str) -> Picture:
         (f"Draw {i + 1}", partial(figures.plot_states, table, draw + blank, label="utility", **limits))
         for i, draw in enumerate(draws)
     ]
-    caption = "Three posterior draws on one scale. Each explains the answers; what they have in common is known."
+    caption = "Three posterior draws on one scale. Where they agree, the utility is well determined."
     alt = f"Three posterior draws of the utility {where}."
     return drawn("draws", panels, caption, alt, columns=3, size=(3.5, 2.9))

@@ -22,7 +22,7 @@ SURPRISING = 0.1
 def find_warnings(
     contents: RunContents, iterations: xr.Dataset, answers: xr.Dataset, scores: xr.Dataset
 ) -> list[ReportWarning]:
-    """What is not in order, most serious first."""
+    """All warnings, most serious first."""
     found = list(contents.damage)
     if contents.features_missing:
         what = (
@@ -96,9 +96,9 @@ def _of_entropy(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarn
         collapsed = first - last > ENTROPY_LOST * size
     if collapsed:
         yield ReportWarning(
-            f"The policy's entropy collapsed, from {first:.2f} to {last:.2f} nats: it hardly explores any more.",
+            f"The policy's entropy collapsed, from {first:.2f} to {last:.2f} nats: it hardly explores.",
             "Right if the value is good. Otherwise the policy settled too early: a smaller --kl-bound narrows it more "
-            "slowly. Another --seed shows whether it was chance.",
+            "slowly. Another --seed shows whether that was chance.",
         )
 
 
@@ -109,7 +109,7 @@ def _of_value(table: xr.Dataset) -> Iterator[ReportWarning]:
         yield ReportWarning(
             f"The value has fallen from {number(value[best])} (iteration {best + 1}) to {number(value[-1])}.",
             "Either the evaluation is noisy, an update was too large (look at the KL, and try a smaller --kl-bound), "
-            "or the posterior is wrong about a policy that no answer is about: more answers help.",
+            "or no answer covers this policy and the posterior is wrong about it: more answers help.",
         )
 
 
