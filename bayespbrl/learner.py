@@ -255,14 +255,16 @@ class Learner:
         """What asks a person the questions in a notebook; needs the extra `people`.
 
         Answers are told and questions asked in the background: cells stay free. `widget.close()` ends it; until then
-        the learner must not be told anything else.
+        the learner must not be told anything else, and no other process can continue the run. A second call closes
+        the widget of the first.
 
         Args:
           answers: most answers of this sitting; None: as many as the run takes.
           answerer: the person's name, kept beside the answers.
 
         Raises:
-          ValueError: the extra is not installed; a bad number or name; a finished run.
+          ValueError: the extra is not installed; a bad number or name; a finished run, one that another process
+            continues, or one to which another learner has written.
         """
         try:
             from bayespbrl.people.widget import ComparisonWidget  # here, since people stand above the learner

@@ -1,6 +1,8 @@
 """A sitting without a browser: turns, what is computed ahead, clips, the widget, and the command line around them."""
 
 import io
+import json
+import subprocess
 import sys
 import time
 from unittest import mock
@@ -438,6 +440,72 @@ def test_the_widget_asks_and_tells_by_its_messages():
         widget.close()
     plain = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(expert, answerer="Ada")
     assert fingerprint(session.learner) == fingerprint(plain)
+
+
+def lines_of(directory):
+    """The events of a run in their order, answers and questions with their numbers."""
+    events = map(json.loads, (directory / "events.jsonl").read_text().splitlines())
+    return [f"{event['event']} {event.get('query', '')}".strip() for event in events]
+
+
+def test_a_cell_that_shows_the_widget_may_run_again_and_nothing_is_asked_twice(directory):
+    learner, opened = bayespbrl.resume(directory), []
+    try:
+        for number in range(3):
+            run = learner if number < 2 else bayespbrl.resume(directory)  # as by a cell that resumes the run too
+            opened.append(run.widget())
+            session = opened[-1].session
+            view = session.wait(timeout=WAIT)
+            assert session.learner.state.query.number == number + 1
+            session.answer(view["turn"], "tie")
+            session.wait(timeout=WAIT)
+        with pytest.raises(Stale, match="session: expected an open one"):
+            opened[0].session.answer(opened[0].session.view["turn"], "tie")
+    finally:
+        for widget in opened:
+            widget.close()
+    asked = [line for line in lines_of(directory) if line.startswith(("asked", "answered"))]
+    assert asked == [f"{event} {number}" for number in (1, 2, 3) for event in ("asked", "answered")] + ["asked 4"]
+    assert len(bayespbrl.resume(directory).ask()) == 1
+    assert not held(directory)
+
+
+def test_a_run_that_another_process_continues_shows_no_widget(directory):
+    learner = bayespbrl.resume(directory)
+    code = "import sys; from bayespbrl.runs.lock import continuing\nwith continuing(sys.argv[1]): print(input())"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code, str(directory)], **pipes) as other:
+        late = time.monotonic() + WAIT
+        while not held(directory):
+            assert time.monotonic() < late
+            time.sleep(0.02)
+        before = (directory / "events.jsonl").read_bytes()
+        with pytest.raises(ValueError, match="this run is being continued elsewhere; stop that program first"):
+            learner.widget()
+        other.communicate("end\n")
+    assert (directory / "events.jsonl").read_bytes() == before
+    bayespbrl.resume(directory).run(lambda first, second: "tie")  # another learner goes on
+    with pytest.raises(ValueError, match="another learner has written to it; resume the run"):
+        learner.widget()
+    assert not held(directory)
+
+
+def test_a_widget_holds_the_run_until_it_is_closed(monkeypatch, capsys, directory):
+    widget = bayespbrl.resume(directory).widget()
+    try:
+        assert "continued elsewhere" in refused(monkeypatch, capsys, "ask", directory)
+    finally:
+        widget.close()
+    assert not held(directory)
+
+
+def held(directory):
+    """Whether somebody continues a run."""
+    try:
+        with continuing(directory):
+            return False
+    except ValueError:
+        return True
 
 
 @pytest.mark.parametrize("options", [{"answers": 0}, {"answerer": ""}])

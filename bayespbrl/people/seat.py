@@ -88,7 +88,7 @@ class Seat:
         The instructions are answered with "begin". What is answered to them and in practice is not kept.
 
         Raises:
-          Stale: the turn is over, or its question is not there yet; nothing has happened.
+          Stale: the turn or the session is over, or the question is not there yet; nothing has happened.
           ValueError: no answer, a bad time, or nothing to take back; nothing has happened.
         """
         self.session.take(self, turn, answer, seconds)

@@ -147,6 +147,8 @@ class Session:
     def take(self, seat: Seat, turn: int, answer: str, seconds: float | None) -> None:
         """What `Seat.answer` does."""
         with self.changed:
+            if self._closing:
+                raise Stale("session: expected an open one, got one that is closed")
             if turn != seat.turn or seat.view["phase"] not in (INSTRUCTIONS, QUESTION):
                 raise Stale(f"turn: expected {seat.turn}, got {turn}")
             if (introduction := self._introducing(seat)) is not None:
