@@ -212,17 +212,20 @@ class Learner:
         ]
         for entry, answer in zip(entries, parsed, strict=True):
             if answer is Answer.UNDO:
-                self.undo()
+                self.undo(answerer=answerer)
             else:
                 self.record(entry)
 
-    def undo(self) -> None:
+    def undo(self, *, answerer: str | None = None) -> None:
         """Take the last answer back, and what followed from it; its question waits again.
 
+        Args:
+          answerer: who takes it back, which is kept.
+
         Raises:
-          ValueError: nothing has been answered yet.
+          ValueError: nothing has been answered yet, or a bad name.
         """
-        self.record(Entry({"event": "undone"}))
+        self.record(events.undone(answerer))
 
     def run(
         self,

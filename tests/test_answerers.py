@@ -89,6 +89,29 @@ def test_a_bad_response_time_is_refused_and_nothing_has_happened(seconds):
     assert run.ask()[0].number == 1
 
 
+@pytest.mark.parametrize("replays", [-1, 1.5, "2", True, 10_001])
+def test_a_number_of_replays_that_is_none_is_refused(replays):
+    run, _ = remembered()
+    run.ask()
+    event = {"event": "answered", "query": 1, "answer": "tie"}
+    with pytest.raises(ValueError, match="replays: expected"):
+        apply(run.state, Entry(event | {"replays": replays}))
+    kept = apply(run.state, Entry(event | {"replays": 10_000, "session": "monday"})).past[-1]
+    assert (kept.session, kept.replays, kept.seconds) == ("monday", 10_000, None)
+    with pytest.raises(ValueError, match="session: expected a printable name"):
+        apply(run.state, Entry(event | {"session": ""}))
+
+
+def test_an_undo_says_whose_it_is(tmp_path):
+    run, log = remembered()
+    run.ask()
+    run.tell(["first"], answerer="Ada")
+    with pytest.raises(ValueError, match="answerer: expected a printable name"):
+        run.undo(answerer="")
+    run.tell(["undo"], answerer="Ada")
+    assert log.entries[-1].event == {"event": "undone", "answerer": "Ada"}
+
+
 def test_a_named_person_who_answers_in_a_loop_is_timed_and_a_simulated_expert_is_not():
     run, log = remembered()
     run.run(ReturnExpert(), answerer="Ada")
@@ -350,13 +373,18 @@ def test_the_answers_of_a_run_as_a_table_and_back(answered_by_two):
     file = run.write_answers()
     assert file == answered_by_two / "preferences.csv"
     lines = file.read_text().splitlines()
-    assert lines[0] == "question,first,second,answer,answerer,seconds,repeats"
+    assert lines[0] == "question,first,second,answer,answerer,seconds,repeats,session,replays"
     assert len(lines) == 1 + len(run.learner.state.past)
     read = read_answers(file)
     asked = [source for source in run.preferences.rows() if source.side]
     assert read.pairs == tuple(run.preferences.pairs[source.number] for source in asked if not source.tied)
     assert read.shown_first.tolist() == [source.side for source in asked]
     assert list(read.answerers) == [source.answerer for source in asked]
+
+
+def test_a_table_of_answers_has_the_session_and_the_replays_where_they_are_known(tmp_path):
+    file = write_answers(tmp_path / "answers.csv", (PAST[4]._replace(session="monday", replays=3), PAST[3]))
+    assert file.read_text().splitlines()[1:] == ["5,1,0,second,Ada,3.0,1,monday,3", "4,6,7,skip,Bob,0.5,,,"]
 
 
 def test_answers_collected_elsewhere_by_hand(tmp_path):

@@ -129,6 +129,26 @@ def test_every_key_and_button_gives_its_answer(browser, gridworld):
         assert all(event["seconds"] > 0 for event in events if event["event"] == "answered")
 
 
+def test_how_often_the_clips_began_again_is_kept_with_the_answer(browser, gridworld):
+    with tab(browser, gridworld) as opened:
+        opened.keyboard.press(" ")  # they stand
+        for times in (0, 2):
+            for _ in range(times):
+                opened.click(".bp-again")
+            opened.focus(".bp-box")
+            press(opened, "tie")
+        opened.select_option(".bp-speed select", "4")
+        opened.focus(".bp-box")
+        opened.keyboard.press(" ")
+        until(opened, lambda: int(opened.get_attribute("canvas >> nth=0", "data-frame")) >= 10)
+        until(opened, lambda: int(opened.get_attribute("canvas >> nth=0", "data-frame")) < 10)  # looped once
+        press(opened, "tie")
+    lines = gridworld.session.learner.log.log_file.read_text().splitlines()
+    replays = [event["replays"] for event in map(json.loads, lines) if event["event"] == "answered"]
+    assert replays[:2] == [0, 2]
+    assert replays[2] >= 1
+
+
 def test_a_key_that_is_held_or_pressed_twice_answers_once(browser, gridworld):
     with tab(browser, gridworld) as opened:
         turn = turn_of(opened)
@@ -318,6 +338,8 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
         json.dumps({"turn": turn, "answer": "first", "seconds": -1}),
         json.dumps({"turn": turn, "answer": "first", "seconds": float("nan")}),
         json.dumps({"turn": turn, "answer": "first", "seconds": "long"}),
+        json.dumps({"turn": turn, "answer": "first", "replays": -1}),
+        json.dumps({"turn": turn, "answer": "first", "replays": 1e9}),
         json.dumps({"turn": turn, "answer": "first", "more": 1}),
         json.dumps({"turn": turn, "answer": "undo"}),  # nothing to take back
     ]

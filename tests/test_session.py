@@ -162,6 +162,30 @@ def test_a_turn_takes_one_answer_and_an_undo_is_a_turn_of_its_own(sitting):
     assert "3 iterations" in view["say"]
 
 
+def test_each_answer_of_a_sitting_has_its_session_and_replays_which_change_nothing(sitting, tmp_path):
+    learner, sessions = bayespbrl.start("gridworld", tmp_path / "run", expert="other", **QUICK), []
+    for replays in (3, None):
+        session = sitting(learner, answerer="Ada", most_answers=2)
+        for given in ("first", "undo", "second", "tie"):
+            view = session.wait(timeout=WAIT)
+            session.answer(view["turn"], given, 1.5, replays)
+        session.wait((FINISHED,), WAIT)
+        session.close()
+        sessions.append(session.name)
+    events = list(map(json.loads, (tmp_path / "run" / "events.jsonl").read_text().splitlines()))
+    answered = [event for event in events if event["event"] == "answered"]
+    assert [event["session"] for event in answered] == [sessions[0]] * 3 + [sessions[1]] * 3
+    assert [event.get("replays") for event in answered] == [3, 3, 3, None, None, None]
+    assert [event for event in events if event["event"] == "undone"] == [{"event": "undone", "answerer": "Ada"}] * 2
+    assert sessions[0] != sessions[1]
+    read = bayespbrl.load(tmp_path / "run")
+    assert [past.replays for past in read.learner.state.past] == [3, 3, None, None]
+    assert read.write_answers().read_text().splitlines()[1].endswith(f",Ada,1.5,,{sessions[0]},3")
+    told = iter(["second", "tie"] * 2)
+    plain = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(lambda a, b: next(told), answerer="Ada")
+    assert fingerprint(learner) == fingerprint(read.learner) == fingerprint(plain)
+
+
 def test_a_sitting_ends_after_its_answers_and_the_run_goes_on(sitting):
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
     view = answer_all(sitting(learner, most_answers=2), lambda first, second: "tie")
@@ -279,7 +303,8 @@ def test_a_full_disk_ends_the_sitting_and_keeps_the_answers(sitting, tmp_path):
 
 @pytest.mark.parametrize(
     "message",
-    [None, [], {"turn": True, "answer": "first"}, {"turn": 1}, {"turn": 1, "answer": "first", "seconds": True}],
+    [None, [], {"turn": True, "answer": "first"}, {"turn": 1}, {"turn": 1, "answer": "first", "seconds": True}]
+    + [{"turn": 1, "answer": "first", "replays": replays} for replays in (-1, 0.5, "1", True, 10_001)],
 )
 def test_a_message_that_is_no_answer_is_refused(message):
     with pytest.raises(ValueError, match="expected"):
