@@ -284,6 +284,18 @@ def test_the_figures_of_each_person_by_hand():
     assert people(()).sizes["answerer"] == 0
 
 
+@pytest.mark.parametrize(
+    ("number", "place"),
+    [(0, None), (4, None), (5, 1), (7, 1), (8, 2), (20, 6), (100, 42)],  # tables of the sign test at 10 %, two-sided
+)
+def test_the_interval_of_a_median_time_is_that_of_the_sign_test(number, place):
+    times = np.random.default_rng(0).permutation(np.arange(1.0, number + 1))
+    past = [PastQuestion(k, 0, 1, 1, None, Answer.FIRST, "Ada", seconds) for k, seconds in enumerate(times)]
+    table = people([*past, PastQuestion(999, 0, 1, 1, None, Answer.FIRST, "Ada", None)])
+    found = [float(table[f"seconds_{end}"][0]) for end in ("lower", "upper")]
+    np.testing.assert_equal(found, [np.nan] * 2 if place is None else [place, number + 1 - place])
+
+
 def test_lapse_rates_and_biases_are_each_persons_own():
     differences = np.array([[1.0], [0.8], [-0.6], [0.5], [-0.9], [0.7]])
     who, sides = ["Bob", "Ada", "Bob", "Ada", "Bob", "Ada"], np.array([1, -1, 1, 1, 1, -1])
@@ -329,7 +341,7 @@ def test_the_report_of_a_run_of_people_says_what_to_do_about_each(answered_by_tw
     section = section[: section.index("\n## ")]
     rows = {line.split("|")[1].strip(): line for line in section.splitlines() if line.startswith("|")}
     assert {"Ada", "Bob"} <= set(rows)
-    assert "| 5.0 s |" in rows["Ada"]
+    assert "| 5.0 s (5.0 to 5.0) |" in rows["Ada"]
     found = [warning.what for warning in people_warnings(read_contents(answered_by_two))]
     assert all(what in head and what in section for what in found)
     assert "Bob favours the trajectory shown first." in found
