@@ -2,9 +2,11 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray as xr
 from toys import QUICK, fingerprint
 
 from bayespbrl import (
@@ -347,6 +349,39 @@ def test_the_report_of_a_run_of_people_says_what_to_do_about_each(answered_by_tw
     assert "Bob favours the trajectory shown first." in found
     assert any(what.startswith("Bob took 0.2 s in the median") for what in found)
     assert not any(what.startswith("Ada") for what in found)
+
+
+def advised(past, lapse_rates):
+    """The advice on each person, by the draws of their lapse rates."""
+    drawn = {"lapse_rate": (("chain", "draw", "answerer"), [np.transpose(list(lapse_rates.values()))])}
+    posterior = xr.DataTree.from_dict({"/posterior": xr.Dataset(drawn, coords={"answerer": list(lapse_rates)})})
+    warnings = people_warnings(SimpleNamespace(past=past, posterior=posterior))
+    return [(warning.what, warning.remedy) for warning in warnings]
+
+
+def test_whoever_mostly_tosses_coins_is_to_be_dropped_and_who_often_does_to_be_trusted_less():
+    surely, often, never = [0.6, 0.7, 0.8], [0.2, 0.3, 0.4], [0.0, 0.1, 0.3]
+    answers = [PastQuestion(k, 0, 1, 1, None, Answer.FIRST, name, 5.0) for k, name in enumerate(("Ada", "Bob", "Cy"))]
+    drop, trust = advised(answers, {"Ada": surely, "Bob": often, "Cy": never})
+    assert drop[0].startswith("Ada: 70 % of the answers look like coin tosses")
+    assert drop[1] == "Drop them. run.estimate_without('Ada') infers the utility without them."
+    assert trust[0].startswith("Bob: 30 % of the answers look like coin tosses")
+    assert trust[1].startswith("Trust them less: the posterior already does.")
+    assert [remedy for _, remedy in advised(answers[:1], {"Ada": surely})] == ["Ask someone else, and start anew."]
+
+
+def test_whoever_contradicts_themselves_is_asked_again_and_who_cannot_tell_is_shown_more():
+    both = [PastQuestion(k, 0, 1, 1, None, Answer.FIRST, "Ada", 5.0) for k in range(4)]
+    both += [PastQuestion(9 + k, 1, 0, 1, k, Answer.FIRST, "Ada", 5.0) for k in range(4)]  # the other one, each time
+    assert advised(both, {"Ada": [0.0, 0.1]}) == [
+        (
+            "Ada: only 0 of 4 repeated questions were answered as before.",
+            "Ask again, with clearer instructions or longer trajectories.",
+        )
+    ]
+    unsure = [PastQuestion(20 + k, 0, 1, 1, None, Answer.SKIP, "Ada", 5.0) for k in range(2)]
+    for number, said in ((1, []), (2, ["Ada could not tell in 2 of 5 questions."])):
+        assert [what for what, _ in advised(both[:3] + unsure[:number], {"Ada": [0.0, 0.1]})] == said
 
 
 def test_a_run_of_the_simulated_expert_has_no_section_on_people(tmp_path, monkeypatch):

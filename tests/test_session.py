@@ -26,7 +26,7 @@ from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session, answer_of
-from bayespbrl.people.views import ALL_GIVEN, FINISHED, QUESTION, THINKING, with_ties
+from bayespbrl.people.views import ALL_GIVEN, FINISHED, LITTLE, QUESTION, THINKING, said_of, with_ties
 from bayespbrl.people.widget import ComparisonWidget
 from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.lock import continuing
@@ -100,6 +100,48 @@ def test_a_tie_is_foreseen_last_until_the_run_has_one():
     present = foresight.move(1, Answer.TIE, foresight.present.after[1, Answer.TIE].state)
     assert present.complete
     assert foreseen(4) == ["second", "first", "skip", "tie"]
+
+
+class Known:
+    """A utility estimate whose draws of both trajectories are given."""
+
+    posterior = "some"
+
+    def __init__(self, *draws):
+        self.draws = np.array(draws)
+
+    def trajectory_draws(self, trajectories, *, number):
+        return self.draws
+
+    def likelihood(self, number):
+        return Logistic(4.0)
+
+
+@pytest.mark.parametrize(
+    ("draws", "sure", "worth", "likely"),
+    [
+        ([(3.0, 0.0), (3.0, 0.0)], 1.0, 0.0, "first"),  # what is certain is worth nothing
+        ([(0.0, 3.0), (0.0, 3.0)], 1.0, 0.0, "second"),
+        ([(9.0, 0.0), (0.0, 9.0)], 0.5, 1.0, "first"),  # the draws disagree: the answer tells all
+        ([(0.1, 0.0), (0.1, 0.0)], 1 / (1 + np.exp(-0.4)), 0.0, "first"),  # a coin toss tells nothing
+    ],
+)
+def test_what_is_said_of_a_question_is_how_sure_the_answer_is_and_what_it_is_worth(draws, sure, worth, likely):
+    query = Query(1, 0, 1, 1, (None, None))
+    said, order = said_of(query, LearnerState(None, estimate=Known(*draws)))
+    np.testing.assert_allclose([said["sure"], said["worth"]], [sure, worth], atol=1e-4)
+    assert order[0] == likely
+    stop = "That is less than 0.01 bit: further answers change little, and you can stop here."
+    assert said["advice"] == (stop if worth < LITTLE else "")
+
+
+def test_a_person_may_stop_from_the_least_worth_on_and_not_before(monkeypatch):
+    query, state = Query(1, 0, 1, 1, (None, None)), LearnerState(None, estimate=Known((1.0, 0.0), (0.9, 0.0)))
+    worth = said_of(query, state)[0]["worth"]
+    for little, stops in ((worth * 1.001, True), (worth * 0.999, False)):
+        monkeypatch.setattr("bayespbrl.people.views.LITTLE", little)
+        assert ("you can stop here" in said_of(query, state)[0]["advice"]) == stops
+    assert said_of(query, LearnerState(None))[0] == {"worth": None, "sure": None, "advice": ""}
 
 
 @pytest.mark.parametrize(
@@ -574,7 +616,14 @@ def test_a_run_that_nobody_can_be_asked_about_is_refused(monkeypatch, capsys, di
 
 @pytest.mark.parametrize(
     ("options", "named"),
-    [(["--answers", "0"], "answers"), (["--answerer", " "], "answerer"), (["--port", "-1"], "port")],
+    [
+        (["--answers", "0"], "answers"),
+        (["--answerer", " "], "answerer"),
+        (["--port", "-1"], "port"),
+        (["--port", "65536"], "port: expected a number from 0 to 65535, got 65536"),
+        (["--host", "192.0.2.1"], "port 0 on 192.0.2.1: cannot listen there"),  # another machine's
+        (["--host", ""], "port 0 on : cannot listen there"),
+    ],
 )
 def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options, named):
     before = (directory / "events.jsonl").read_bytes()

@@ -71,10 +71,12 @@ class Page:
         self._seats = {secrets.token_urlsafe(16): seat for seat in session.seats}
         self.token = next(iter(self._seats))  # of the first or only person
         self._heard: dict[int, str | None] = {}  # the key of the answer to each turn
+        if not 0 <= port <= 65535:
+            raise ValueError(f"port: expected a number from 0 to 65535, got {port}")
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, port), family=family)
-        except (OSError, OverflowError) as error:
+        except OSError as error:
             raise ValueError(f"port {port} on {host}: cannot listen there ({error})") from error
         self.host, self.port = host, self._socket.getsockname()[1]
         config = uvicorn.Config(
