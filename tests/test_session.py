@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import time
+import webbrowser
 from unittest import mock
 
 import gymnasium
@@ -17,6 +18,7 @@ from toys import QUICK, Slope, fingerprint
 
 import bayespbrl
 from bayespbrl.cli.commands import main
+from bayespbrl.cli.opening import ELSEWHERE, open_in_browser, somebody_looks
 from bayespbrl.events import LearnerState
 from bayespbrl.models.likelihoods import Logistic
 from bayespbrl.people.clips import MOST_BYTES, Clips
@@ -300,6 +302,49 @@ def test_a_quiet_line_now_and_then_says_that_a_person_may_pause(sitting, monkeyp
         notices.append(view["notice"])
         session.answer(view["turn"], "tie")
     assert notices == ["", "", "You have given 2 answers. Pause when you like; nothing is lost.", ""]
+
+
+@pytest.mark.parametrize("command", ["run", "ask"])
+@pytest.mark.parametrize(
+    ("options", "changes", "opens"),
+    [
+        ([], {}, True),
+        (["--no-browser"], {}, False),
+        (["--answerer", "Ada", "--answerer", "Ben"], {}, False),
+        ([], {"DISPLAY": ""}, False),
+        ([], {"SSH_CONNECTION": "10.0.0.1"}, False),
+        ([], {"CI": "true"}, False),
+    ],
+)
+def test_the_page_is_opened_where_somebody_looks_unless_told(
+    monkeypatch, capsys, directory, tmp_path, command, options, changes, opens
+):
+    opened = []
+    monkeypatch.setattr("bayespbrl.people.page.Page.serve", lambda page: page._socket.close())
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr("bayespbrl.cli.opening.sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("webbrowser.get", lambda: mock.Mock(open=opened.append))
+    for name in (*ELSEWHERE, "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in ({"DISPLAY": ":0"} | changes).items():
+        monkeypatch.setenv(name, value)
+    chosen = (
+        ["ask", directory] if command == "ask" else ["run", "gridworld", "--expert", "page", "--out", tmp_path / "new"]
+    )
+    monkeypatch.setattr(sys, "argv", ["bayespbrl", *map(str, chosen), *options])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    printed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("http://")]
+    assert (stop.value.code, opened) == (0, printed if opens else [])
+    assert opens or len(printed) == ("Ada" not in options)
+
+
+def test_a_browser_that_needs_the_terminal_and_one_that_is_not_there_are_left_alone(monkeypatch):
+    monkeypatch.setattr("webbrowser.get", lambda: webbrowser.GenericBrowser("lynx"))
+    assert not open_in_browser("http://127.0.0.1:1/")
+    monkeypatch.setattr("webbrowser.get", mock.Mock(side_effect=webbrowser.Error))
+    assert not open_in_browser("http://127.0.0.1:1/")
+    assert not somebody_looks({"DISPLAY": ":0"})  # a test's output is no terminal
 
 
 @pytest.mark.parametrize("command", ["run", "ask"])
@@ -631,9 +676,10 @@ def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options,
     assert (directory / "events.jsonl").read_bytes() == before
 
 
-def test_a_simulated_expert_takes_no_practice(monkeypatch, capsys, tmp_path):
-    error = refused(monkeypatch, capsys, "run", "gridworld", "--no-practice", "--out", tmp_path / "new")
-    assert "practice: expected --no-practice with the expert page alone" in error
+@pytest.mark.parametrize("option", ["practice", "browser"])
+def test_a_simulated_expert_takes_no_practice_and_no_browser(monkeypatch, capsys, tmp_path, option):
+    error = refused(monkeypatch, capsys, "run", "gridworld", f"--no-{option}", "--out", tmp_path / "new")
+    assert f"{option}: expected --no-{option} with the expert page alone" in error
     assert not (tmp_path / "new").exists()
 
 
