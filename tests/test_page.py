@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from contextlib import closing, contextmanager
+from importlib.resources import files
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -17,7 +18,8 @@ import pytest
 from toys import QUICK, READY, Slope, fingerprint
 
 import bayespbrl
-from bayespbrl.people.page import LARGEST_BODY, Page
+from bayespbrl.people.clips import MOST_BYTES
+from bayespbrl.people.page import KINDS, LARGEST_BODY, SHELL, Page
 from bayespbrl.people.session import Session
 from bayespbrl.people.views import UNKNOWN
 
@@ -436,6 +438,34 @@ def test_a_message_that_is_sent_again_is_heard_once_and_one_of_another_window_is
     assert sent == [204, 204, 409, 204]
     assert call(gridworld, "POST", f"/{gridworld.token}/answer", body)[0] == 409
     assert answers_of(gridworld) == ["first"]
+
+
+class Snow(Slope):
+    """Its pictures are noise, which compresses worst."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's interface)
+    render_mode = "rgb_array"
+
+    def render(self):
+        return np.random.default_rng(self.life).integers(0, 255, (500, 900, 3), dtype=np.uint8)
+
+
+def test_a_first_question_with_the_page_around_it_weighs_at_most_two_megabytes():
+    page_itself = len(SHELL) + sum(len(files("bayespbrl.people").joinpath(name).read_bytes()) for name in KINDS)
+    rest = 50_000  # of headers and views, which are a thousand bytes each
+    assert page_itself + 2 * MOST_BYTES + rest <= 2_000_000
+    with served(bayespbrl.Learner(Snow(), expert="other", **QUICK | {"max_steps": 60})) as page:
+        turn = page.session.wait(timeout=60)["turn"]
+        weight = len(json.dumps(page.session.view))
+        for path in ("", *KINDS, f"clip/{turn}/0", f"clip/{turn}/1"):
+            with closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)) as connection:
+                connection.request("GET", f"/{page.token}/{path}")
+                with connection.getresponse() as reply:
+                    weight += len(reply.read()) + len(str(reply.headers))
+        clips = [len(page.session.sheet(turn, side)) for side in (0, 1)]
+    assert page_itself + sum(clips) < weight <= page_itself + sum(clips) + rest
+    assert MOST_BYTES / 3 < max(clips) <= MOST_BYTES
+    assert weight <= 2_000_000
 
 
 def test_ten_megabytes_are_not_read(gridworld):
