@@ -254,7 +254,9 @@ class Learner:
             self._advance(progress)
         return self
 
-    def widget(self, *, answers: int | None = None, answerer: str | None = None) -> "ComparisonWidget":
+    def widget(
+        self, *, answers: int | None = None, answerer: str | None = None, practice: bool = True
+    ) -> "ComparisonWidget":
         """What asks a person the questions in a notebook; needs the extra `people`.
 
         Answers are told and questions asked in the background: cells stay free. `widget.close()` ends it; until then
@@ -264,6 +266,7 @@ class Learner:
         Args:
           answers: most answers of this sitting; None: as many as the run takes.
           answerer: the person's name, kept beside the answers.
+          practice: whether instructions and two practice questions come first, for a person new to this run.
 
         Raises:
           ValueError: the extra is not installed; a bad number or name; a finished run, one that another process
@@ -273,7 +276,7 @@ class Learner:
             from bayespbrl.people.widget import ComparisonWidget  # here, since people stand above the learner
         except ImportError as error:
             raise ValueError(f"the widget needs the extra people: pip install 'bayespbrl[people]' ({error})") from error
-        return ComparisonWidget(self, most_answers=answers, answerer=answerer)
+        return ComparisonWidget(self, most_answers=answers, answerer=answerer, practice=practice)
 
     def _waiting(self) -> list[Query]:
         return [] if self.finished else list(self.state.open)

@@ -534,7 +534,7 @@ def test_a_clip_of_many_large_pictures_is_made_to_fit():
 
 def test_the_widget_asks_and_tells_by_its_messages():
     expert = bayespbrl.ReturnExpert()
-    widget = bayespbrl.Learner("gridworld", expert="other", **QUICK).widget(answerer="Ada")
+    widget = bayespbrl.Learner("gridworld", expert="other", **QUICK).widget(answerer="Ada", practice=False)
     assert isinstance(widget, ComparisonWidget)
     try:
         session = widget.session
@@ -554,6 +554,27 @@ def test_the_widget_asks_and_tells_by_its_messages():
     assert fingerprint(session.learner) == fingerprint(plain)
 
 
+def test_the_widget_begins_with_the_practice_for_a_person_new_to_the_run(directory):
+    learner = bayespbrl.resume(directory)
+    widget, before = learner.widget(answerer="Ada"), lines_of(directory)
+    phases = []
+    try:
+        for given in ("begin", "first", "tie"):
+            view = widget.session.wait(("instructions", QUESTION), WAIT)
+            phases.append((view["phase"], view["practice"]))
+            assert widget.view == view
+            assert (widget.first.startswith(b"\x89PNG"), widget.second != b"") == (given != "begin",) * 2
+            widget._handle_custom_msg({"turn": view["turn"], "answer": given}, [])
+        assert phases == [("instructions", None), (QUESTION, (1, 2)), (QUESTION, (2, 2))]
+        assert widget.session.wait(timeout=WAIT)["practice"] is None
+        assert lines_of(directory) == before
+        widget._handle_custom_msg({"turn": widget.view["turn"], "answer": "tie"}, [])
+        widget = learner.widget(answerer="Ada")  # again, when Ada has answered
+        assert widget.session.wait(("instructions", QUESTION), WAIT)["phase"] == QUESTION
+    finally:
+        widget.close()
+
+
 def lines_of(directory):
     """The events of a run in their order, answers and questions with their numbers."""
     events = map(json.loads, (directory / "events.jsonl").read_text().splitlines())
@@ -565,7 +586,7 @@ def test_a_cell_that_shows_the_widget_may_run_again_and_nothing_is_asked_twice(d
     try:
         for number in range(3):
             run = learner if number < 2 else bayespbrl.resume(directory)  # as by a cell that resumes the run too
-            opened.append(run.widget())
+            opened.append(run.widget(practice=False))
             session = opened[-1].session
             view = session.wait(timeout=WAIT)
             assert session.learner.state.query.number == number + 1

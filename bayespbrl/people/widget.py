@@ -38,14 +38,15 @@ class ComparisonWidget(anywidget.AnyWidget):
     _opened = False
     whole_page = traitlets.Bool(False).tag(sync=True)
 
-    def __init__(self, learner: Learner, *, most_answers: int | None = None, answerer: str | None = None):
+    def __init__(self, learner: Learner, **options: Any):
+        """`options` are those of `Session`."""
         for earlier in [widget for widget in OPEN if _same_run(widget.session.learner, learner)]:
             earlier.close()
         with ExitStack() as held:  # let go of where anything is refused
             if isinstance(learner.log, RunDirectory):
                 held.enter_context(continuing(learner.log.path))
                 learner.log.check_newest()
-            self.session = Session(learner, most_answers=most_answers, answerer=answerer)
+            self.session = Session(learner, **options)
             super().__init__()
             self.view = dict(self.session.view)
             self.on_msg(self._hear)
