@@ -212,17 +212,20 @@ class Learner:
         ]
         for entry, answer in zip(entries, parsed, strict=True):
             if answer is Answer.UNDO:
-                self.undo()
+                self.undo(answerer=answerer)
             else:
                 self.record(entry)
 
-    def undo(self) -> None:
+    def undo(self, *, answerer: str | None = None) -> None:
         """Take the last answer back, and what followed from it; its question waits again.
 
+        Args:
+          answerer: who takes it back, which is kept.
+
         Raises:
-          ValueError: nothing has been answered yet.
+          ValueError: nothing has been answered yet, or a bad name.
         """
-        self.record(Entry({"event": "undone"}))
+        self.record(events.undone(answerer))
 
     def run(
         self,
@@ -251,24 +254,29 @@ class Learner:
             self._advance(progress)
         return self
 
-    def widget(self, *, answers: int | None = None, answerer: str | None = None) -> "ComparisonWidget":
+    def widget(
+        self, *, answers: int | None = None, answerer: str | None = None, practice: bool = True
+    ) -> "ComparisonWidget":
         """A notebook widget that asks a person the learner's questions; needs the extra `people`.
 
         Answers are told and questions asked in the background: cells stay free. `widget.close()` ends it; until then
-        the learner must not be told anything else.
+        the learner must not be told anything else, and no other process can continue the run. A second call closes
+        the widget of the first.
 
         Args:
           answers: most answers of this sitting; None: as many as the run takes.
           answerer: the person's name, kept beside the answers.
+          practice: whether instructions and two practice questions come first, for a person new to this run.
 
         Raises:
-          ValueError: the extra is not installed; a bad number or name; a finished run.
+          ValueError: the extra is not installed; a bad number or name; a finished run, one that another process
+            continues, or one to which another learner has written.
         """
         try:
             from bayespbrl.people.widget import ComparisonWidget  # here, since people stand above the learner
         except ImportError as error:
             raise ValueError(f"the widget needs the extra people: pip install 'bayespbrl[people]' ({error})") from error
-        return ComparisonWidget(self, most_answers=answers, answerer=answerer)
+        return ComparisonWidget(self, most_answers=answers, answerer=answerer, practice=practice)
 
     def _waiting(self) -> list[Query]:
         return [] if self.finished else list(self.state.open)

@@ -66,6 +66,8 @@ class PastQuestion(NamedTuple):
       number, first, second, newcomer, repeats: as of `Query`.
       answer: `FIRST`, `SECOND`, `TIE` or `SKIP`.
       answerer, seconds: who gave it, and how long they took; None: not known.
+      session: of the sitting, the same for all its answers; None: not known.
+      replays: how often the clips began again while the question was shown; None: not known.
     """
 
     number: int
@@ -76,6 +78,8 @@ class PastQuestion(NamedTuple):
     answer: Answer
     answerer: str | None
     seconds: float | None
+    session: str | None = None
+    replays: int | None = None
 
     @property
     def preferred(self) -> int | None:

@@ -2,9 +2,11 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray as xr
 from toys import QUICK, fingerprint
 
 from bayespbrl import (
@@ -87,6 +89,29 @@ def test_a_bad_response_time_is_refused_and_nothing_has_happened(seconds):
         run.tell(["first"], answerer="Ada", seconds=seconds)
     assert log.answers() == []
     assert run.ask()[0].number == 1
+
+
+@pytest.mark.parametrize("replays", [-1, 1.5, "2", True, 10_001])
+def test_a_number_of_replays_that_is_none_is_refused(replays):
+    run, _ = remembered()
+    run.ask()
+    event = {"event": "answered", "query": 1, "answer": "tie"}
+    with pytest.raises(ValueError, match="replays: expected"):
+        apply(run.state, Entry(event | {"replays": replays}))
+    kept = apply(run.state, Entry(event | {"replays": 10_000, "session": "monday"})).past[-1]
+    assert (kept.session, kept.replays, kept.seconds) == ("monday", 10_000, None)
+    with pytest.raises(ValueError, match="session: expected a printable name"):
+        apply(run.state, Entry(event | {"session": ""}))
+
+
+def test_an_undo_says_whose_it_is(tmp_path):
+    run, log = remembered()
+    run.ask()
+    run.tell(["first"], answerer="Ada")
+    with pytest.raises(ValueError, match="answerer: expected a printable name"):
+        run.undo(answerer="")
+    run.tell(["undo"], answerer="Ada")
+    assert log.entries[-1].event == {"event": "undone", "answerer": "Ada"}
 
 
 def test_a_named_person_who_answers_in_a_loop_is_timed_and_a_simulated_expert_is_not():
@@ -261,6 +286,18 @@ def test_the_figures_of_each_person_by_hand():
     assert people(()).sizes["answerer"] == 0
 
 
+@pytest.mark.parametrize(
+    ("number", "place"),
+    [(0, None), (4, None), (5, 1), (7, 1), (8, 2), (20, 6), (100, 42)],  # tables of the sign test at 10 %, two-sided
+)
+def test_the_interval_of_a_median_time_is_that_of_the_sign_test(number, place):
+    times = np.random.default_rng(0).permutation(np.arange(1.0, number + 1))
+    past = [PastQuestion(k, 0, 1, 1, None, Answer.FIRST, "Ada", seconds) for k, seconds in enumerate(times)]
+    table = people([*past, PastQuestion(999, 0, 1, 1, None, Answer.FIRST, "Ada", None)])
+    found = [float(table[f"seconds_{end}"][0]) for end in ("lower", "upper")]
+    np.testing.assert_equal(found, [np.nan] * 2 if place is None else [place, number + 1 - place])
+
+
 def test_lapse_rates_and_biases_are_each_persons_own():
     differences = np.array([[1.0], [0.8], [-0.6], [0.5], [-0.9], [0.7]])
     who, sides = ["Bob", "Ada", "Bob", "Ada", "Bob", "Ada"], np.array([1, -1, 1, 1, 1, -1])
@@ -306,12 +343,45 @@ def test_the_report_of_a_run_of_people_says_what_to_do_about_each(answered_by_tw
     section = section[: section.index("\n## ")]
     rows = {line.split("|")[1].strip(): line for line in section.splitlines() if line.startswith("|")}
     assert {"Ada", "Bob"} <= set(rows)
-    assert "| 5.0 s |" in rows["Ada"]
+    assert "| 5.0 s (5.0 to 5.0) |" in rows["Ada"]
     found = [warning.what for warning in people_warnings(read_contents(answered_by_two))]
     assert all(what in head and what in section for what in found)
     assert "Bob favours the trajectory shown first." in found
     assert any(what.startswith("Bob took 0.2 s in the median") for what in found)
     assert not any(what.startswith("Ada") for what in found)
+
+
+def advised(past, lapse_rates):
+    """The advice on each person, by the draws of their lapse rates."""
+    drawn = {"lapse_rate": (("chain", "draw", "answerer"), [np.transpose(list(lapse_rates.values()))])}
+    posterior = xr.DataTree.from_dict({"/posterior": xr.Dataset(drawn, coords={"answerer": list(lapse_rates)})})
+    warnings = people_warnings(SimpleNamespace(past=past, posterior=posterior))
+    return [(warning.what, warning.remedy) for warning in warnings]
+
+
+def test_whoever_mostly_tosses_coins_is_to_be_dropped_and_who_often_does_to_be_trusted_less():
+    surely, often, never = [0.6, 0.7, 0.8], [0.2, 0.3, 0.4], [0.0, 0.1, 0.3]
+    answers = [PastQuestion(k, 0, 1, 1, None, Answer.FIRST, name, 5.0) for k, name in enumerate(("Ada", "Bob", "Cy"))]
+    drop, trust = advised(answers, {"Ada": surely, "Bob": often, "Cy": never})
+    assert drop[0].startswith("Ada: 70 % of the answers look like coin tosses")
+    assert drop[1] == "Drop them. run.estimate_without('Ada') infers the utility without them."
+    assert trust[0].startswith("Bob: 30 % of the answers look like coin tosses")
+    assert trust[1].startswith("Trust them less: the posterior already does.")
+    assert [remedy for _, remedy in advised(answers[:1], {"Ada": surely})] == ["Ask someone else, and start anew."]
+
+
+def test_whoever_contradicts_themselves_is_asked_again_and_who_cannot_tell_is_shown_more():
+    both = [PastQuestion(k, 0, 1, 1, None, Answer.FIRST, "Ada", 5.0) for k in range(4)]
+    both += [PastQuestion(9 + k, 1, 0, 1, k, Answer.FIRST, "Ada", 5.0) for k in range(4)]  # the other one, each time
+    assert advised(both, {"Ada": [0.0, 0.1]}) == [
+        (
+            "Ada: only 0 of 4 repeated questions were answered as before.",
+            "Ask again, with clearer instructions or longer trajectories.",
+        )
+    ]
+    unsure = [PastQuestion(20 + k, 0, 1, 1, None, Answer.SKIP, "Ada", 5.0) for k in range(2)]
+    for number, said in ((1, []), (2, ["Ada could not tell in 2 of 5 questions."])):
+        assert [what for what, _ in advised(both[:3] + unsure[:number], {"Ada": [0.0, 0.1]})] == said
 
 
 def test_a_run_of_the_simulated_expert_has_no_section_on_people(tmp_path, monkeypatch):
@@ -350,13 +420,18 @@ def test_the_answers_of_a_run_as_a_table_and_back(answered_by_two):
     file = run.write_answers()
     assert file == answered_by_two / "preferences.csv"
     lines = file.read_text().splitlines()
-    assert lines[0] == "question,first,second,answer,answerer,seconds,repeats"
+    assert lines[0] == "question,first,second,answer,answerer,seconds,repeats,session,replays"
     assert len(lines) == 1 + len(run.learner.state.past)
     read = read_answers(file)
     asked = [source for source in run.preferences.rows() if source.side]
     assert read.pairs == tuple(run.preferences.pairs[source.number] for source in asked if not source.tied)
     assert read.shown_first.tolist() == [source.side for source in asked]
     assert list(read.answerers) == [source.answerer for source in asked]
+
+
+def test_a_table_of_answers_has_the_session_and_the_replays_where_they_are_known(tmp_path):
+    file = write_answers(tmp_path / "answers.csv", (PAST[4]._replace(session="monday", replays=3), PAST[3]))
+    assert file.read_text().splitlines()[1:] == ["5,1,0,second,Ada,3.0,1,monday,3", "4,6,7,skip,Bob,0.5,,,"]
 
 
 def test_answers_collected_elsewhere_by_hand(tmp_path):

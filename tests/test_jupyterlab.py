@@ -75,6 +75,17 @@ def give(opened, key, turn):
             opened.click(".bp-ask")
 
 
+def practise(opened):
+    """Begin the practice by the button, and answer its two questions by keys."""
+    opened.click(".bp-box[data-phase=instructions][data-locked=false] [data-answer=begin]")
+    for number in (1, 2):
+        opened.wait_for_selector(f"{READY} >> text=Practice {number} of 2")
+        opened.click(".bp-ask")
+        give(opened, KEYS["tie"], opened.get_attribute(".bp-box", "data-turn"))
+    opened.wait_for_selector(f"{READY} >> text=The practice is over")
+    opened.click(".bp-ask")
+
+
 @pytest.mark.slow
 def test_a_scripted_person_answers_a_whole_run_in_jupyterlab(browser, lab):
     address, folder = lab
@@ -85,14 +96,13 @@ def test_a_scripted_person_answers_a_whole_run_in_jupyterlab(browser, lab):
     opened.goto(address)
     opened.wait_for_selector("[data-status=idle], .jp-Notebook-ExecutionIndicator[data-status=idle]")
     run_first_cell(opened)
-    opened.wait_for_selector(READY)
-    opened.click(".bp-ask")
+    practise(opened)
     while questions := plain.ask():
         turn = opened.get_attribute(".bp-box", "data-turn")
         answer = str(expert(*questions[0].trajectories))
         give(opened, KEYS[answer], turn)
         plain.tell([answer])
-        if turn == "1":  # keys that JupyterLab would act on, and a cell while a question waits
+        if plain.preferences.answers == 1:  # keys that JupyterLab would act on, and a cell while a question waits
             for key in ("a", "b", "x", "z"):
                 opened.keyboard.press(key)
             opened.click(".jp-CodeCell >> nth=1 >> .cm-content")

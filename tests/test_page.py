@@ -4,11 +4,13 @@ import http.client
 import json
 import os
 import random
+import signal
 import subprocess
 import sys
 import threading
 import time
 from contextlib import closing, contextmanager
+from importlib.resources import files
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -16,8 +18,10 @@ import pytest
 from toys import QUICK, READY, Slope, fingerprint
 
 import bayespbrl
-from bayespbrl.people.page import LARGEST_BODY, Page
+from bayespbrl.people.clips import MOST_BYTES
+from bayespbrl.people.page import KINDS, LARGEST_BODY, SHELL, Page
 from bayespbrl.people.session import Session
+from bayespbrl.people.views import UNKNOWN
 
 pytestmark = pytest.mark.slow
 KEYS = {"first": "ArrowLeft", "second": "ArrowRight", "tie": "ArrowDown", "skip": "s", "undo": "u"}
@@ -46,13 +50,18 @@ def gridworld(tmp_path):
 
 
 @contextmanager
-def tab(browser, page, ready=READY, address=None, **options):
-    """A tab of the browser in a context of its own, which shows a question, or what `ready` selects."""
+def tab(browser, page, ready=READY, address=None, before=None, **options):
+    """A tab of the browser in a context of its own, which shows a question, or what `ready` selects.
+
+    `before` is called with the tab before it makes its first request.
+    """
     context = browser.new_context(**options)
     context.set_default_timeout(120_000)  # milliseconds; machines may be busy
     try:
         opened = context.new_page()
         opened.on("pageerror", lambda error: pytest.fail(f"JavaScript: {error}"))
+        if before is not None:
+            before(opened)
         opened.goto(address or page.address)
         opened.wait_for_selector(ready)
         yield opened
@@ -98,8 +107,11 @@ def answers_of(page):
 
 def test_a_scripted_person_answers_a_whole_run_as_the_simulated_expert_does(browser, gridworld):
     expert, requests = bayespbrl.ReturnExpert(), []
-    with tab(browser, gridworld) as opened:
+
+    def listen(opened):
         opened.on("request", lambda request: requests.append(request.url))
+
+    with tab(browser, gridworld, before=listen) as opened:
         while opened.get_attribute(".bp-box", "data-phase") != "finished":
             query = settled(gridworld).state.query
             press(opened, str(expert(*query.trajectories)))
@@ -107,7 +119,7 @@ def test_a_scripted_person_answers_a_whole_run_as_the_simulated_expert_does(brow
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(expert)
     assert learner.preferences.answers == 4
     assert fingerprint(settled(gridworld)) == fingerprint(learner)
-    assert requests
+    assert {url.removeprefix(gridworld.address) for url in requests} >= {"", "host.js", "front.js", "front.css"}
     assert [url for url in requests if not url.startswith(gridworld.address)] == []
 
 
@@ -127,6 +139,26 @@ def test_every_key_and_button_gives_its_answer(browser, gridworld):
         assert answers_of(gridworld) == given
         events = map(json.loads, gridworld.session.learner.log.log_file.read_text().splitlines())
         assert all(event["seconds"] > 0 for event in events if event["event"] == "answered")
+
+
+def test_how_often_the_clips_began_again_is_kept_with_the_answer(browser, gridworld):
+    with tab(browser, gridworld) as opened:
+        opened.keyboard.press(" ")  # they stand
+        for times in (0, 2):
+            for _ in range(times):
+                opened.click(".bp-again")
+            opened.focus(".bp-box")
+            press(opened, "tie")
+        opened.select_option(".bp-speed select", "4")
+        opened.focus(".bp-box")
+        opened.keyboard.press(" ")
+        until(opened, lambda: int(opened.get_attribute("canvas >> nth=0", "data-frame")) >= 10)
+        until(opened, lambda: int(opened.get_attribute("canvas >> nth=0", "data-frame")) < 10)  # looped once
+        press(opened, "tie")
+    lines = gridworld.session.learner.log.log_file.read_text().splitlines()
+    replays = [event["replays"] for event in map(json.loads, lines) if event["event"] == "answered"]
+    assert replays[:2] == [0, 2]
+    assert replays[2] >= 1
 
 
 def test_a_key_that_is_held_or_pressed_twice_answers_once(browser, gridworld):
@@ -163,6 +195,68 @@ def test_a_reload_and_a_second_tab_show_the_same_question_and_count_no_answer_tw
         assert answers_of(gridworld) == ["first", "second"]
         notes = [each.locator(".bp-note") for each in (opened, other)]
         until(opened, lambda: sum("another window" in note.inner_text() for note in notes) == 1)
+
+
+def test_a_key_that_was_held_before_the_question_came_answers_nothing(browser, gridworld):
+    with tab(browser, gridworld) as opened:
+        turn = turn_of(opened)
+        opened.evaluate(
+            "for (const key of ['ArrowLeft', 'ArrowRight', 's', 'u'])"
+            " document.body.dispatchEvent(new KeyboardEvent('keydown', {key, repeat: true, bubbles: true}))"
+        )
+        assert opened.is_visible(READY)  # still unlocked
+        press(opened, "tie")
+        assert turn_of(opened) == turn + 1
+        assert answers_of(gridworld) == ["tie"]
+
+
+def test_what_the_learner_knows_of_an_answer_is_shown_and_that_one_can_stop(browser, gridworld, monkeypatch):
+    said = {"sure": 0.987, "worth": 0.004, "advice": "You can stop here."}
+    monkeypatch.setattr("bayespbrl.people.views.said_of", lambda query, state: (said, UNKNOWN))
+    with tab(browser, gridworld) as opened:
+        press(opened, "tie")  # what was drawn before says nothing
+        press(opened, "tie")
+        assert opened.inner_text(".bp-learner").strip() == (
+            "The learner is 99 % sure what you will say. Your answer is worth about 0.00 bit, of 1 at most. "
+            "You can stop here."
+        )
+
+
+def test_while_the_learner_computes_the_page_says_thinking(browser, gridworld):
+    with tab(browser, gridworld) as opened:
+        held = []
+        opened.route("**/answer", lambda route: held.append(route))
+        turn = turn_of(opened)
+        opened.keyboard.press("ArrowLeft")
+        opened.wait_for_selector(".bp-box[data-phase=thinking][data-locked=true]")
+        assert opened.inner_text(".bp-ask") == "Thinking…"
+        opened.keyboard.press("ArrowRight")
+        until(opened, lambda: len(held) == 1)
+        held[0].continue_()
+        next_turn(opened, turn)
+        assert answers_of(gridworld) == ["first"]
+
+
+def test_a_page_that_hears_no_more_views_says_so_and_goes_on_when_it_hears_them_again(browser, gridworld):
+    gridworld.session.wait(timeout=60)
+    back, tried = threading.Event(), []
+
+    def break_off(route):
+        tried.append(route)
+        if back.is_set():
+            return route.continue_()
+        if len(tried) > 1:
+            return route.abort()
+        body = f"data: {json.dumps(gridworld.session.view)}\n\n"  # and then the stream ends
+        return route.fulfill(body=body, content_type="text/event-stream")
+
+    with tab(browser, gridworld, before=lambda opened: opened.route("**/events", break_off)) as opened:
+        opened.wait_for_selector(".bp-note >> text=The connection is lost. Trying again…")
+        until(opened, lambda: len(tried) >= 3)
+        back.set()
+        opened.wait_for_selector(".bp-note", state="hidden")
+        press(opened, "second")
+        assert answers_of(gridworld) == ["second"]
 
 
 @pytest.mark.parametrize("heard", [False, True])
@@ -215,6 +309,9 @@ def test_the_clips_stay_in_step_and_can_be_paused_scrubbed_and_sped_up(browser):
         opened.focus(".bp-box")
         opened.keyboard.press(" ")
         assert np.array(opened.evaluate(watch, 0.5)).max() >= 15  # of 60 frames in three seconds at speed 1
+        opened.select_option(".bp-speed select", "0.5")
+        opened.click(".bp-again")
+        assert 4 <= np.array(opened.evaluate(watch, 1.0)).max() <= 15  # 10 at half the speed
         assert page.session.learner.preferences.answers == 0
 
 
@@ -318,6 +415,8 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
         json.dumps({"turn": turn, "answer": "first", "seconds": -1}),
         json.dumps({"turn": turn, "answer": "first", "seconds": float("nan")}),
         json.dumps({"turn": turn, "answer": "first", "seconds": "long"}),
+        json.dumps({"turn": turn, "answer": "first", "replays": -1}),
+        json.dumps({"turn": turn, "answer": "first", "replays": 1e9}),
         json.dumps({"turn": turn, "answer": "first", "more": 1}),
         json.dumps({"turn": turn, "answer": "undo"}),  # nothing to take back
     ]
@@ -339,6 +438,34 @@ def test_a_message_that_is_sent_again_is_heard_once_and_one_of_another_window_is
     assert sent == [204, 204, 409, 204]
     assert call(gridworld, "POST", f"/{gridworld.token}/answer", body)[0] == 409
     assert answers_of(gridworld) == ["first"]
+
+
+class Snow(Slope):
+    """Its pictures are noise, which compresses worst."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's interface)
+    render_mode = "rgb_array"
+
+    def render(self):
+        return np.random.default_rng(self.life).integers(0, 255, (500, 900, 3), dtype=np.uint8)
+
+
+def test_a_first_question_with_the_page_around_it_weighs_at_most_two_megabytes():
+    page_itself = len(SHELL) + sum(len(files("bayespbrl.people").joinpath(name).read_bytes()) for name in KINDS)
+    rest = 50_000  # of headers and views, which are a thousand bytes each
+    assert page_itself + 2 * MOST_BYTES + rest <= 2_000_000
+    with served(bayespbrl.Learner(Snow(), expert="other", **QUICK | {"max_steps": 60})) as page:
+        turn = page.session.wait(timeout=60)["turn"]
+        weight = len(json.dumps(page.session.view))
+        for path in ("", *KINDS, f"clip/{turn}/0", f"clip/{turn}/1"):
+            with closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)) as connection:
+                connection.request("GET", f"/{page.token}/{path}")
+                with connection.getresponse() as reply:
+                    weight += len(reply.read()) + len(str(reply.headers))
+        clips = [len(page.session.sheet(turn, side)) for side in (0, 1)]
+    assert page_itself + sum(clips) < weight <= page_itself + sum(clips) + rest
+    assert MOST_BYTES / 3 < max(clips) <= MOST_BYTES
+    assert weight <= 2_000_000
 
 
 def test_ten_megabytes_are_not_read(gridworld):
@@ -424,6 +551,30 @@ class Person:
             with connection.getresponse() as reply:
                 assert reply.status == 204
         self.acknowledged.append(given)
+
+
+def test_ctrl_c_ends_a_sitting_with_its_status_and_the_same_command_goes_on(tmp_path):
+    bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
+    person = Person(tmp_path / "run")
+    command = [sys.executable, "-m", "bayespbrl", "ask", str(tmp_path / "run"), "--no-practice"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        try:
+            lines = iter(server.stdout.readline, "")
+            address = urlsplit(next(line.strip() for line in lines if line.startswith("http://")))
+            for view in person._views(address):
+                if view["phase"] == "question" and view["answered"] == 1:
+                    break
+                if view["phase"] == "question":
+                    person._answer(address, view)
+            server.send_signal(signal.SIGINT)
+            said, errors = server.communicate(timeout=60)
+        finally:
+            server.kill()
+    assert (server.returncode, errors) == (130, "")
+    assert f"Stopped. Nothing is lost: bayespbrl ask {tmp_path / 'run'}" in said
+    assert person.sit(None)
+    assert person.acknowledged == [(0, "first"), (1, "second"), (2, "first"), (3, "second")]
+    assert bayespbrl.load(tmp_path / "run").learner.finished
 
 
 def test_a_server_that_is_killed_at_any_moment_loses_no_answer_and_counts_none_twice(tmp_path):

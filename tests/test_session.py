@@ -1,8 +1,11 @@
 """A sitting without a browser: turns, what is computed ahead, clips, the widget, and the command line around them."""
 
 import io
+import json
+import subprocess
 import sys
 import time
+import webbrowser
 from unittest import mock
 
 import gymnasium
@@ -15,6 +18,7 @@ from toys import QUICK, Slope, fingerprint
 
 import bayespbrl
 from bayespbrl.cli.commands import main
+from bayespbrl.cli.opening import ELSEWHERE, open_in_browser, somebody_looks
 from bayespbrl.events import LearnerState
 from bayespbrl.models.likelihoods import Logistic
 from bayespbrl.people.clips import MOST_BYTES, Clips
@@ -24,7 +28,7 @@ from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session, answer_of
-from bayespbrl.people.views import ALL_GIVEN, FINISHED, QUESTION, THINKING, with_ties
+from bayespbrl.people.views import ALL_GIVEN, FINISHED, LITTLE, QUESTION, THINKING, said_of, with_ties
 from bayespbrl.people.widget import ComparisonWidget
 from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.lock import continuing
@@ -100,6 +104,48 @@ def test_a_tie_is_foreseen_last_until_the_run_has_one():
     assert foreseen(4) == ["second", "first", "skip", "tie"]
 
 
+class Known:
+    """A utility estimate whose draws of both trajectories are given."""
+
+    posterior = "some"
+
+    def __init__(self, *draws):
+        self.draws = np.array(draws)
+
+    def trajectory_draws(self, trajectories, *, number):
+        return self.draws
+
+    def likelihood(self, number):
+        return Logistic(4.0)
+
+
+@pytest.mark.parametrize(
+    ("draws", "sure", "worth", "likely"),
+    [
+        ([(3.0, 0.0), (3.0, 0.0)], 1.0, 0.0, "first"),  # what is certain is worth nothing
+        ([(0.0, 3.0), (0.0, 3.0)], 1.0, 0.0, "second"),
+        ([(9.0, 0.0), (0.0, 9.0)], 0.5, 1.0, "first"),  # the draws disagree: the answer tells all
+        ([(0.1, 0.0), (0.1, 0.0)], 1 / (1 + np.exp(-0.4)), 0.0, "first"),  # a coin toss tells nothing
+    ],
+)
+def test_what_is_said_of_a_question_is_how_sure_the_answer_is_and_what_it_is_worth(draws, sure, worth, likely):
+    query = Query(1, 0, 1, 1, (None, None))
+    said, order = said_of(query, LearnerState(None, estimate=Known(*draws)))
+    np.testing.assert_allclose([said["sure"], said["worth"]], [sure, worth], atol=1e-4)
+    assert order[0] == likely
+    stop = "That is less than 0.01 bit: further answers change little, and you can stop here."
+    assert said["advice"] == (stop if worth < LITTLE else "")
+
+
+def test_a_person_may_stop_from_the_least_worth_on_and_not_before(monkeypatch):
+    query, state = Query(1, 0, 1, 1, (None, None)), LearnerState(None, estimate=Known((1.0, 0.0), (0.9, 0.0)))
+    worth = said_of(query, state)[0]["worth"]
+    for little, stops in ((worth * 1.001, True), (worth * 0.999, False)):
+        monkeypatch.setattr("bayespbrl.people.views.LITTLE", little)
+        assert ("you can stop here" in said_of(query, state)[0]["advice"]) == stops
+    assert said_of(query, LearnerState(None))[0] == {"worth": None, "sure": None, "advice": ""}
+
+
 @pytest.mark.parametrize(
     ("margin", "threshold", "order"),
     [
@@ -158,6 +204,30 @@ def test_a_turn_takes_one_answer_and_an_undo_is_a_turn_of_its_own(sitting):
     view = answer_all(session, lambda first, second: "tie")
     assert view["answered"] == 4
     assert "3 iterations" in view["say"]
+
+
+def test_each_answer_of_a_sitting_has_its_session_and_replays_which_change_nothing(sitting, tmp_path):
+    learner, sessions = bayespbrl.start("gridworld", tmp_path / "run", expert="other", **QUICK), []
+    for replays in (3, None):
+        session = sitting(learner, answerer="Ada", most_answers=2)
+        for given in ("first", "undo", "second", "tie"):
+            view = session.wait(timeout=WAIT)
+            session.answer(view["turn"], given, 1.5, replays)
+        session.wait((FINISHED,), WAIT)
+        session.close()
+        sessions.append(session.name)
+    events = list(map(json.loads, (tmp_path / "run" / "events.jsonl").read_text().splitlines()))
+    answered = [event for event in events if event["event"] == "answered"]
+    assert [event["session"] for event in answered] == [sessions[0]] * 3 + [sessions[1]] * 3
+    assert [event.get("replays") for event in answered] == [3, 3, 3, None, None, None]
+    assert [event for event in events if event["event"] == "undone"] == [{"event": "undone", "answerer": "Ada"}] * 2
+    assert sessions[0] != sessions[1]
+    read = bayespbrl.load(tmp_path / "run")
+    assert [past.replays for past in read.learner.state.past] == [3, 3, None, None]
+    assert read.write_answers().read_text().splitlines()[1].endswith(f",Ada,1.5,,{sessions[0]},3")
+    told = iter(["second", "tie"] * 2)
+    plain = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(lambda a, b: next(told), answerer="Ada")
+    assert fingerprint(learner) == fingerprint(read.learner) == fingerprint(plain)
 
 
 def test_a_sitting_ends_after_its_answers_and_the_run_goes_on(sitting):
@@ -235,6 +305,49 @@ def test_a_quiet_line_now_and_then_says_that_a_person_may_pause(sitting, monkeyp
 
 
 @pytest.mark.parametrize("command", ["run", "ask"])
+@pytest.mark.parametrize(
+    ("options", "changes", "opens"),
+    [
+        ([], {}, True),
+        (["--no-browser"], {}, False),
+        (["--answerer", "Ada", "--answerer", "Ben"], {}, False),
+        ([], {"DISPLAY": ""}, False),
+        ([], {"SSH_CONNECTION": "10.0.0.1"}, False),
+        ([], {"CI": "true"}, False),
+    ],
+)
+def test_the_page_is_opened_where_somebody_looks_unless_told(
+    monkeypatch, capsys, directory, tmp_path, command, options, changes, opens
+):
+    opened = []
+    monkeypatch.setattr("bayespbrl.people.page.Page.serve", lambda page: page._socket.close())
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr("bayespbrl.cli.opening.sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("webbrowser.get", lambda: mock.Mock(open=opened.append))
+    for name in (*ELSEWHERE, "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in ({"DISPLAY": ":0"} | changes).items():
+        monkeypatch.setenv(name, value)
+    chosen = (
+        ["ask", directory] if command == "ask" else ["run", "gridworld", "--expert", "page", "--out", tmp_path / "new"]
+    )
+    monkeypatch.setattr(sys, "argv", ["bayespbrl", *map(str, chosen), *options])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    printed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("http://")]
+    assert (stop.value.code, opened) == (0, printed if opens else [])
+    assert opens or len(printed) == ("Ada" not in options)
+
+
+def test_a_browser_that_needs_the_terminal_and_one_that_is_not_there_are_left_alone(monkeypatch):
+    monkeypatch.setattr("webbrowser.get", lambda: webbrowser.GenericBrowser("lynx"))
+    assert not open_in_browser("http://127.0.0.1:1/")
+    monkeypatch.setattr("webbrowser.get", mock.Mock(side_effect=webbrowser.Error))
+    assert not open_in_browser("http://127.0.0.1:1/")
+    assert not somebody_looks({"DISPLAY": ":0"})  # a test's output is no terminal
+
+
+@pytest.mark.parametrize("command", ["run", "ask"])
 @pytest.mark.parametrize(("options", "first"), [([], True), (["--no-practice"], False)])
 def test_the_command_line_begins_with_the_practice_unless_told(
     monkeypatch, directory, tmp_path, command, options, first
@@ -277,7 +390,8 @@ def test_a_full_disk_ends_the_sitting_and_keeps_the_answers(sitting, tmp_path):
 
 @pytest.mark.parametrize(
     "message",
-    [None, [], {"turn": True, "answer": "first"}, {"turn": 1}, {"turn": 1, "answer": "first", "seconds": True}],
+    [None, [], {"turn": True, "answer": "first"}, {"turn": 1}, {"turn": 1, "answer": "first", "seconds": True}]
+    + [{"turn": 1, "answer": "first", "replays": replays} for replays in (-1, 0.5, "1", True, 10_001)],
 )
 def test_a_message_that_is_no_answer_is_refused(message):
     with pytest.raises(ValueError, match="expected"):
@@ -420,7 +534,7 @@ def test_a_clip_of_many_large_pictures_is_made_to_fit():
 
 def test_the_widget_asks_and_tells_by_its_messages():
     expert = bayespbrl.ReturnExpert()
-    widget = bayespbrl.Learner("gridworld", expert="other", **QUICK).widget(answerer="Ada")
+    widget = bayespbrl.Learner("gridworld", expert="other", **QUICK).widget(answerer="Ada", practice=False)
     assert isinstance(widget, ComparisonWidget)
     try:
         session = widget.session
@@ -438,6 +552,93 @@ def test_the_widget_asks_and_tells_by_its_messages():
         widget.close()
     plain = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(expert, answerer="Ada")
     assert fingerprint(session.learner) == fingerprint(plain)
+
+
+def test_the_widget_begins_with_the_practice_for_a_person_new_to_the_run(directory):
+    learner = bayespbrl.resume(directory)
+    widget, before = learner.widget(answerer="Ada"), lines_of(directory)
+    phases = []
+    try:
+        for given in ("begin", "first", "tie"):
+            view = widget.session.wait(("instructions", QUESTION), WAIT)
+            phases.append((view["phase"], view["practice"]))
+            assert widget.view == view
+            assert (widget.first.startswith(b"\x89PNG"), widget.second != b"") == (given != "begin",) * 2
+            widget._handle_custom_msg({"turn": view["turn"], "answer": given}, [])
+        assert phases == [("instructions", None), (QUESTION, (1, 2)), (QUESTION, (2, 2))]
+        assert widget.session.wait(timeout=WAIT)["practice"] is None
+        assert lines_of(directory) == before
+        widget._handle_custom_msg({"turn": widget.view["turn"], "answer": "tie"}, [])
+        widget = learner.widget(answerer="Ada")  # again, when Ada has answered
+        assert widget.session.wait(("instructions", QUESTION), WAIT)["phase"] == QUESTION
+    finally:
+        widget.close()
+
+
+def lines_of(directory):
+    """The events of a run in their order, answers and questions with their numbers."""
+    events = map(json.loads, (directory / "events.jsonl").read_text().splitlines())
+    return [f"{event['event']} {event.get('query', '')}".strip() for event in events]
+
+
+def test_a_cell_that_shows_the_widget_may_run_again_and_nothing_is_asked_twice(directory):
+    learner, opened = bayespbrl.resume(directory), []
+    try:
+        for number in range(3):
+            run = learner if number < 2 else bayespbrl.resume(directory)  # as by a cell that resumes the run too
+            opened.append(run.widget(practice=False))
+            session = opened[-1].session
+            view = session.wait(timeout=WAIT)
+            assert session.learner.state.query.number == number + 1
+            session.answer(view["turn"], "tie")
+            session.wait(timeout=WAIT)
+        with pytest.raises(Stale, match="session: expected an open one"):
+            opened[0].session.answer(opened[0].session.view["turn"], "tie")
+    finally:
+        for widget in opened:
+            widget.close()
+    asked = [line for line in lines_of(directory) if line.startswith(("asked", "answered"))]
+    assert asked == [f"{event} {number}" for number in (1, 2, 3) for event in ("asked", "answered")] + ["asked 4"]
+    assert len(bayespbrl.resume(directory).ask()) == 1
+    assert not held(directory)
+
+
+def test_a_run_that_another_process_continues_shows_no_widget(directory):
+    learner = bayespbrl.resume(directory)
+    code = "import sys; from bayespbrl.runs.lock import continuing\nwith continuing(sys.argv[1]): print(input())"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code, str(directory)], **pipes) as other:
+        late = time.monotonic() + WAIT
+        while not held(directory):
+            assert time.monotonic() < late
+            time.sleep(0.02)
+        before = (directory / "events.jsonl").read_bytes()
+        with pytest.raises(ValueError, match="this run is being continued elsewhere; stop that program first"):
+            learner.widget()
+        other.communicate("end\n")
+    assert (directory / "events.jsonl").read_bytes() == before
+    bayespbrl.resume(directory).run(lambda first, second: "tie")  # another learner goes on
+    with pytest.raises(ValueError, match="another learner has written to it; resume the run"):
+        learner.widget()
+    assert not held(directory)
+
+
+def test_a_widget_holds_the_run_until_it_is_closed(monkeypatch, capsys, directory):
+    widget = bayespbrl.resume(directory).widget()
+    try:
+        assert "continued elsewhere" in refused(monkeypatch, capsys, "ask", directory)
+    finally:
+        widget.close()
+    assert not held(directory)
+
+
+def held(directory):
+    """Whether somebody continues a run."""
+    try:
+        with continuing(directory):
+            return False
+    except ValueError:
+        return True
 
 
 @pytest.mark.parametrize("options", [{"answers": 0}, {"answerer": ""}])
@@ -481,7 +682,14 @@ def test_a_run_that_nobody_can_be_asked_about_is_refused(monkeypatch, capsys, di
 
 @pytest.mark.parametrize(
     ("options", "named"),
-    [(["--answers", "0"], "answers"), (["--answerer", " "], "answerer"), (["--port", "-1"], "port")],
+    [
+        (["--answers", "0"], "answers"),
+        (["--answerer", " "], "answerer"),
+        (["--port", "-1"], "port"),
+        (["--port", "65536"], "port: expected a number from 0 to 65535, got 65536"),
+        (["--host", "192.0.2.1"], "port 0 on 192.0.2.1: cannot listen there"),  # another machine's
+        (["--host", ""], "port 0 on : cannot listen there"),
+    ],
 )
 def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options, named):
     before = (directory / "events.jsonl").read_bytes()
@@ -489,9 +697,10 @@ def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options,
     assert (directory / "events.jsonl").read_bytes() == before
 
 
-def test_a_simulated_expert_takes_no_practice(monkeypatch, capsys, tmp_path):
-    error = refused(monkeypatch, capsys, "run", "gridworld", "--no-practice", "--out", tmp_path / "new")
-    assert "practice: expected --no-practice with the expert page alone" in error
+@pytest.mark.parametrize("option", ["practice", "browser"])
+def test_a_simulated_expert_takes_no_practice_and_no_browser(monkeypatch, capsys, tmp_path, option):
+    error = refused(monkeypatch, capsys, "run", "gridworld", f"--no-{option}", "--out", tmp_path / "new")
+    assert f"{option}: expected --no-{option} with the expert page alone" in error
     assert not (tmp_path / "new").exists()
 
 

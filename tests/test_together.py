@@ -223,6 +223,58 @@ def test_a_question_is_repeated_to_the_person_who_answered_it(sitting):
     assert all(question.answerer == past[question.repeats].answerer for question in again)
 
 
+@pytest.fixture
+def repeat_waits(tmp_path):
+    """The directory of a run that Ada left when a repeat of her question waited, and the number of the repeat."""
+    options = QUICK | {"iterations": 8, "repeats": 0.3}
+    learner = bayespbrl.start("gridworld", tmp_path / "left", expert="page", **options)
+    while (query := learner.ask()[0]).repeats is None:
+        learner.tell(["first"], answerer="Ada")
+    return tmp_path / "left", query.number
+
+
+def alone(directory, name, answers=None):
+    """A sitting of one person, who always says "first": the numbers of the questions, and those that then wait."""
+    learner = bayespbrl.resume(directory)
+    session, numbers = Session(learner, answerer=name, most_answers=answers).open(), []
+    try:
+        while (view := session.wait(timeout=WAIT))["phase"] == QUESTION:
+            numbers.append(session.seats[0].number)
+            session.answer(view["turn"], "first")
+        assert view["phase"] == FINISHED
+    finally:
+        session.close()
+    assert fingerprint(bayespbrl.load(directory).learner) == fingerprint(learner)
+    return numbers, [query.number for query in learner.state.open]
+
+
+def test_a_waiting_repeat_is_not_shown_to_another_person_alone_and_waits_for_whoever_is_meant(repeat_waits):
+    directory, number = repeat_waits
+    answered, waiting = alone(directory, "Bob", answers=2)
+    assert number not in answered
+    assert answered[0] == number + 1
+    assert number in waiting
+    assert alone(directory, "Ada", answers=2)[0][0] == number
+    alone(directory, "Bob")
+    past = {question.number: question for question in bayespbrl.load(directory).learner.state.past}
+    assert past[number].answerer == "Ada"
+    again = [question for question in past.values() if question.repeats is not None]
+    assert all(question.answerer == past[question.repeats].answerer for question in again)
+
+
+def test_a_run_ends_though_a_repeat_waits_for_somebody_who_has_left(repeat_waits):
+    directory, number = repeat_waits
+    answered, waiting = alone(directory, "Bob")
+    assert number not in answered
+    assert number in waiting
+    assert bayespbrl.load(directory).learner.finished
+
+
+def test_whoever_gives_no_name_is_shown_the_question_that_waits(repeat_waits):
+    directory, number = repeat_waits
+    assert alone(directory, None, answers=1)[0] == [number]
+
+
 @pytest.mark.parametrize("names", [["Ada", "Ada"], ["Ada", ""], []])
 def test_bad_names_are_refused(names):
     with pytest.raises(ValueError, match="answerer: expected"):

@@ -21,6 +21,7 @@ from bayespbrl.cli.display import (
     show_run,
     show_trials,
 )
+from bayespbrl.cli.opening import Place
 from bayespbrl.cli.studies import run_study, show_plan
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.experts import SIMULATED
@@ -47,6 +48,12 @@ Answerer = Annotated[
 Practice = Annotated[
     bool,
     typer.Option(help="Instructions and two practice questions for a person who has not answered in this run yet."),
+]
+Browser = Annotated[
+    bool,
+    typer.Option(
+        help="Open the page in the browser; only from a terminal with a display, not over SSH, and for one person."
+    ),
 ]
 ImportPackage = Annotated[
     bool, typer.Option("--import-package", help="Import the package that the run's environment names (it runs code).")
@@ -115,16 +122,20 @@ def run(
     out: Annotated[Path | None, typer.Option(help="Run directory; a new one under runs/ if omitted.")] = None,
     answerer: Answerer = None,
     practice: Practice = True,
+    browser: Browser = True,
     **options: Any,
 ) -> None:
     """Learn a task from preferences; the run is kept in a directory."""
     _check_expert(options.get("expert"), answerer or [])
     if not practice and options.get("expert") != "page":
         raise ValueError("practice: expected --no-practice with the expert page alone")
+    if not browser and options.get("expert") != "page":
+        raise ValueError("browser: expected --no-browser with the expert page alone")
     directory = out or fresh_directory(env)
     learner = runs.start(env, directory, seed=seed, **options)
     with continuing(directory):
-        run_to_the_end(learner, directory, answerers=answerer or [], practice=practice)
+        place = Place(browser=browser)
+        run_to_the_end(learner, directory, answerers=answerer or [], practice=practice, place=place)
 
 
 @app.command()
@@ -155,6 +166,7 @@ def ask(
     practice: Practice = True,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 accepts other machines.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; a free one if omitted.")] = 0,
+    browser: Browser = True,
     import_package: ImportPackage = False,
 ) -> None:
     """Ask a person the questions of a run on a page in the browser; repeat the command to go on later."""
@@ -167,7 +179,7 @@ def ask(
                 f"expert: expected a run that a person answers, got {expert}, a simulated one: {directory}"
             )
         options: dict[str, Any] = {"answers": answers, "answerers": answerer or [], "practice": practice}
-        ask_on_page(learner, directory, **options, host=host, port=port)
+        ask_on_page(learner, directory, **options, place=Place(host, port, browser))
 
 
 @app.command()

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
+from bayespbrl.cli.opening import Place, open_in_browser, somebody_looks
 from bayespbrl.envs.opening import environment_attribute, open_environment
 from bayespbrl.experts import TerminalExpert
 from bayespbrl.figures import new_figure, png
@@ -21,15 +22,24 @@ from bayespbrl.trajectories import Trajectory
 
 console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may contain square brackets
 PICTURE = "run.png"
+PLACE = Place()
 
 
-def run_to_the_end(learner: Learner, directory: Path, *, answerers: Sequence[str] = (), practice: bool = True) -> None:
+def run_to_the_end(
+    learner: Learner,
+    directory: Path,
+    *,
+    answerers: Sequence[str] = (),
+    practice: bool = True,
+    place: Place = PLACE,
+) -> None:
     """Run a learner that keeps its events in `directory` to its end, with its progress, then `show_run`.
 
-    `answerers` are the names of the people who answer, at most one at the terminal; `practice` as of `ask_on_page`.
+    `answerers` are the names of the people who answer, at most one at the terminal; `practice` and `place` as of
+    `ask_on_page`.
     """
     if learner.settings.expert == "page":
-        return ask_on_page(learner, directory, answerers=answerers, practice=practice)
+        return ask_on_page(learner, directory, answerers=answerers, practice=practice, place=place)
     console.print(f"Run directory: {directory}")
     try:
         if learner.settings.expert == "terminal":
@@ -50,8 +60,7 @@ def ask_on_page(
     answers: int | None = None,
     answerers: Sequence[str] = (),
     practice: bool = True,
-    host: str = "127.0.0.1",
-    port: int = 0,
+    place: Place = PLACE,
 ) -> None:
     """Ask a person the questions of a run on a page, until it is finished or the person stops.
 
@@ -60,7 +69,7 @@ def ask_on_page(
       answers: most answers of this sitting.
       answerers: the names of those who answer at once, each on a page of their own; kept beside the answers.
       practice: whether a person who has not answered in this run yet gets instructions and practice first.
-      host, port: of the page; port 0 for a free one.
+      place: where the page listens, and whether it is opened in the browser, which it is for one person alone.
 
     Raises:
       ValueError: the extra is not installed, or the port is in use.
@@ -70,10 +79,12 @@ def ask_on_page(
     from bayespbrl.people.session import Session
 
     session = Session(learner, most_answers=answers, answerer=answerers or None, practice=practice)
-    page = Page(session, host=host, port=port)
+    page = Page(session, host=place.host, port=place.port)
     console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:")
     for name, address in zip(answerers or [""], page.addresses, strict=True):
         console.print(f"{name}: {address}" if len(answerers) > 1 else address)
+    if place.browser and len(page.addresses) == 1 and somebody_looks():
+        open_in_browser(page.address)
     try:
         page.serve()
     except KeyboardInterrupt:

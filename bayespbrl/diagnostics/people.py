@@ -24,7 +24,8 @@ def people(past: Sequence[PastQuestion], posterior: xr.DataTree | None = None) -
       standard deviations of the margins; NaN where it is not inferred); `repeated`, how many of their answers were
       asked for again from them and answered, and `consistent`, how many of these said the same, with
       `consistency_lower` and `consistency_upper`, the exact 90 % interval of its share (Clopper and Pearson 1934);
-      `seconds`, the median response time, NaN where none is known.
+      `seconds`, the median response time, NaN where none is known, with `seconds_lower` and `seconds_upper`, two order
+      statistics between which the median lies with a probability of at least 90 %, NaN with fewer than five times.
     """
     names = list(dict.fromkeys(question.answerer or "" for question in past))
     # a posterior that knows no names was fitted to one answerer: whoever answered first
@@ -54,6 +55,7 @@ def _figures(name: str, past: Sequence[PastQuestion], posterior: xr.DataTree | N
     }
     interval = stats.binomtest(consistent, len(again)).proportion_ci(LEVEL, method="exact") if again else (0.0, 1.0)
     figures |= {"consistency_lower": float(interval[0]), "consistency_upper": float(interval[1])}
+    figures["seconds_lower"], figures["seconds_upper"] = _around_median(times)
     for quantity in ("lapse_rate", "side_bias"):
         draws = _draws(name, quantity, posterior)
         figures[quantity] = float(np.mean(draws))
@@ -61,6 +63,15 @@ def _figures(name: str, past: Sequence[PastQuestion], posterior: xr.DataTree | N
             float(end) for end in np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
         )
     return figures
+
+
+def _around_median(times: Sequence[float]) -> tuple[float, float]:
+    """The narrowest symmetric pair of order statistics that holds the median with at least `LEVEL`; NaN without one."""
+    outside = int(stats.binom.ppf((1 - LEVEL) / 2, len(times), 0.5))  # its ends, counted from 1 from either side
+    if outside == 0:
+        return np.nan, np.nan
+    ordered = sorted(times)
+    return float(ordered[outside - 1]), float(ordered[-outside])
 
 
 def _known_to(posterior: xr.DataTree | None, name: str, alone: str) -> xr.DataTree | None:

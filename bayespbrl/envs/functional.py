@@ -15,6 +15,8 @@ from gymnasium.experimental.functional import FuncEnv
 from jax import Array
 from jaxtyping import Key, Shaped, UInt8
 
+from bayespbrl.figures import new_figure, pixels
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -27,9 +29,6 @@ class Drawn(Protocol):
     @property
     def terminated(self) -> bool: ...
     def __len__(self) -> int: ...
-
-
-from bayespbrl.figures import new_figure, pixels
 
 
 def reset(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Any, Any]:

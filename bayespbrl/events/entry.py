@@ -31,18 +31,51 @@ class Log(Protocol):
     def append(self, entry: Entry, state: LearnerState) -> None: ...
 
 
-def answered(query: int, answer: Answer, *, answerer: str | None = None, seconds: float | None = None) -> Entry:
-    """The event of an answer to question number `query`; arguments as of `Learner.tell`.
+MOST_REPLAYS = 10_000  # that are kept of one question
+
+
+def answered(
+    query: int,
+    answer: Answer,
+    *,
+    answerer: str | None = None,
+    seconds: float | None = None,
+    session: str | None = None,
+    replays: int | None = None,
+) -> Entry:
+    """The event of an answer to question number `query`.
+
+    Args:
+      answerer, seconds: as of `Learner.tell`.
+      session: of the sitting, the same in all its answers.
+      replays: how often the clips began again while the question was shown.
 
     Raises:
-      ValueError: an answerer that is no short name, or a time that is no finite number >= 0.
+      ValueError: an answerer or session that is no short name, a time that is no finite number >= 0, or replays that
+        are no whole number from 0 to `MOST_REPLAYS`.
     """
-    event: dict[str, Any] = {"event": "answered", "query": query, "answer": str(answer)}
-    if answerer is not None:
-        event["answerer"] = checks.short_name("answerer", answerer)
-    if seconds is not None:
-        event["seconds"] = checks.non_negative("seconds", seconds)
-    return Entry(event)
+    about = {"answerer": answerer, "seconds": seconds, "session": session, "replays": replays}
+    return Entry({"event": "answered", "query": query, "answer": str(answer), **checked_about(about)})
+
+
+def undone(answerer: str | None = None) -> Entry:
+    """The event of an undo by this person; `ValueError` where that is no short name."""
+    return Entry({"event": "undone", **checked_about({"answerer": answerer})})
+
+
+def checked_about(event: Mapping[str, Any]) -> dict[str, Any]:
+    """What an event says about who answered and how, of what is known; `ValueError` as of `answered`."""
+    known: dict[str, Any] = {}
+    for name in ("answerer", "session"):
+        if event.get(name) is not None:
+            known[name] = checks.short_name(name, event[name])
+    if event.get("seconds") is not None:
+        known["seconds"] = checks.non_negative("seconds", event["seconds"])
+    if event.get("replays") is not None:
+        known["replays"] = checks.whole("replays", event["replays"], 0)
+        if known["replays"] > MOST_REPLAYS:
+            raise ValueError(f"replays: expected at most {MOST_REPLAYS}, got {known['replays']}")
+    return known
 
 
 def surviving(log: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

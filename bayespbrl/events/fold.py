@@ -6,13 +6,14 @@ from dataclasses import replace
 from typing import Any
 
 from bayespbrl import checks
-from bayespbrl.events.entry import Entry, clips_in, has_figures
+from bayespbrl.events.entry import Entry, checked_about, clips_in, has_figures
 from bayespbrl.events.state import LearnerState, Restart
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.preferences import Answer, PastQuestion, Query, parse_answer
 
 # Each state holds all answers so far: to keep every state would take memory by the square of their number.
 MOST_UNDONE = 50
+ABOUT = ("seconds", "session", "replays")  # the last fields of a `PastQuestion`
 
 
 def apply(state: LearnerState, entry: Entry) -> LearnerState:
@@ -32,6 +33,7 @@ def apply(state: LearnerState, entry: Entry) -> LearnerState:
         case "improved":
             return _improved(state, event, entry.parts)
         case "undone":
+            checked_about(event)
             if (before := state.previous) is None:
                 got = f"{MOST_UNDONE} undone" if state.past else "none yet"
                 raise ValueError(f"undo: expected an answer to take back, got {got}")
@@ -153,14 +155,13 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     if query is None:
         waiting = [waiting.number for waiting in state.open]
         raise ValueError(f"answered: expected an answer to an open question of {waiting}, got one to {event['query']}")
-    answer, answerer, seconds = parse_answer(event["answer"]), event.get("answerer"), event.get("seconds")
-    checks.optional(checks.short_name, "answerer", answerer)
-    checks.optional(checks.non_negative, "seconds", seconds)
+    answer, about = parse_answer(event["answer"]), checked_about(event)
+    answerer = about.get("answerer")
     left, again = state.candidates, query.repeats is not None
     if not again:
         left = tuple(number for number in left if number != query.newcomer)
     shown = (query.number, query.first, query.second, query.newcomer, query.repeats)
-    past = (*state.past, PastQuestion(*shown, answer, answerer, seconds))
+    past = (*state.past, PastQuestion(*shown, answer, answerer, *(about.get(name) for name in ABOUT)))
     after = replace(state, open=tuple(each for each in state.open if each is not query), candidates=left, past=past)
     after = replace(after, before=(*state.before[1 - MOST_UNDONE :], replace(state, before=())))
     if answer is Answer.SKIP:

@@ -28,7 +28,7 @@ from bayespbrl.trajectories import Trajectory
 
 MOST_FRAMES = 80
 SLOW_FRAMES = 30  # where a picture takes hundredths of a second
-MOST_BYTES = 1_000_000  # of a clip; a question has two
+MOST_BYTES = 950_000  # of a clip; a question has two, and with the page itself it takes at most 2 MB
 REMEMBERED = 12  # clips
 SHORTEST, LONGEST = 2.5, 8.0  # seconds that a clip takes at speed 1
 COLOURS = 128

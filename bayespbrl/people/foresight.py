@@ -93,6 +93,8 @@ class Foresight:
         return entry
 
     def _next(self, moment: Moment) -> Entry | None:
+        if not self.several and moment.state.open and not moment.holders:  # repeats that wait for somebody else
+            return self.cycle.next(moment.state, self.people[0], others=0)
         if not self.several:
             return self.cycle.next(moment.state)
         held, left = len(moment.holders), self._left(moment)
@@ -144,7 +146,7 @@ class Foresight:
     def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
         """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.
 
-        A repeated question is left to whoever answered the first one.
+        A repeated question is left to whoever answered the first one, unless one person without a name answers.
         """
         if state.finished(self.cycle.settings):
             return {}
@@ -152,7 +154,7 @@ class Foresight:
         holders = {number: who for number, who in before.items() if number in waiting and who in self.people}
         for query in sorted(state.open, key=lambda query: query.answerer not in self.people):
             free = [name for name in self.people if name not in holders.values()]
-            if self.several and query.repeats is not None:
+            if query.repeats is not None and self.people != (None,):
                 free = [past.answerer for past in state.past if past.number == query.repeats and past.answerer in free]
             if free and query.number not in holders:
                 holders[query.number] = query.answerer if query.answerer in free else free[0]

@@ -5,7 +5,7 @@
 //                  answerer, practice: [number, of], notice}
 //   first, second  the sprite sheets of the two clips, bytes
 //   whole_page     whether keys count wherever the focus is
-// It sends {turn, answer, seconds} and hears, as "msg:custom", {refused: turn, say} and {connection: "lost" | "back"}.
+// It sends {turn, answer, seconds, replays} and hears, as "msg:custom", {refused: turn, say} and {connection: "lost" | "back"}.
 // A turn is answered at most once: after an answer everything is locked until the next turn or a refusal.
 
 const KEYS = {
@@ -16,6 +16,7 @@ const SAID = {
   first: "First is better", second: "Second is better", tie: "No difference", skip: "Skipped", undo: "Taken back", begin: "Practice",
 };
 const LOST = "The connection is lost. Trying again…";
+const MOST_REPLAYS = 10000; // that are sent
 const REST = 0.8; // seconds on the last picture before the clips start again
 
 const HTML = `
@@ -89,7 +90,7 @@ class Film {
 
   load(clips, sheets, rate) {
     for (const sheet of this.sheets ?? []) sheet.close();
-    Object.assign(this, { clips, sheets, rate, at: 0, longest: Math.max(...clips.map((clip) => clip.steps)) });
+    Object.assign(this, { clips, sheets, rate, at: 0, replays: 0, longest: Math.max(...clips.map((clip) => clip.steps)) });
     this.canvases.forEach((canvas, k) => {
       canvas.width = clips[k].width;
       canvas.height = clips[k].height;
@@ -109,13 +110,18 @@ class Film {
     this.draw();
   }
 
+  again() {
+    this.replays = Math.min(this.replays + 1, MOST_REPLAYS);
+    this.move(0);
+  }
+
   tick(now) {
     const seconds = Math.min(0.25, (now - (this.last ?? now)) / 1000);
     this.last = now;
     if (!this.playing || !this.clips.length) return;
     this.at += seconds * this.rate * this.speed;
-    if (this.at > this.longest + REST * this.rate * this.speed) this.at = 0;
-    this.draw();
+    if (this.at > this.longest + REST * this.rate * this.speed) this.again();
+    else this.draw();
   }
 
   draw() {
@@ -248,7 +254,8 @@ function render({ model, el }) {
     warn(null);
     live.textContent = SAID[which];
     slow = setTimeout(() => { box.dataset.phase = "thinking"; say("Thinking…"); }, 150);
-    model.send({ turn: view.turn, answer: which, seconds: (performance.now() - shown) / 1000 });
+    const seconds = (performance.now() - shown) / 1000;
+    model.send({ turn: view.turn, answer: which, seconds, replays: film.replays ?? 0 });
   }
 
   function hear(message) {
@@ -283,7 +290,7 @@ function render({ model, el }) {
     if (button) answer(button.dataset.answer);
   });
   film.button.addEventListener("click", () => film.play(!film.playing));
-  find(".bp-again").addEventListener("click", () => film.clips.length && film.move(0));
+  find(".bp-again").addEventListener("click", () => film.clips.length && film.again());
   find(".bp-speed select").addEventListener("change", ({ target }) => { film.speed = Number(target.value); });
   film.scrub.addEventListener("input", () => {
     film.play(false);

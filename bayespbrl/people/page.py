@@ -14,6 +14,7 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Mapping
 from importlib.resources import files
+from typing import Any
 
 import uvicorn
 from starlette.applications import Starlette
@@ -70,10 +71,12 @@ class Page:
         self._seats = {secrets.token_urlsafe(16): seat for seat in session.seats}
         self.token = next(iter(self._seats))  # of the first or only person
         self._heard: dict[int, str | None] = {}  # the key of the answer to each turn
+        if not 0 <= port <= 65535:
+            raise ValueError(f"port: expected a number from 0 to 65535, got {port}")
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, port), family=family)
-        except (OSError, OverflowError) as error:
+        except OSError as error:
             raise ValueError(f"port {port} on {host}: cannot listen there ({error})") from error
         self.host, self.port = host, self._socket.getsockname()[1]
         config = uvicorn.Config(
@@ -159,11 +162,11 @@ class Page:
             return PlainTextResponse(" ".join(str(error).split())[:300], 400)
         return Response(status_code=204)
 
-    def _take(self, seat: Seat, key: str | None, turn: int, answer: str, seconds: float | None) -> None:
+    def _take(self, seat: Seat, key: str | None, turn: int, *given: Any) -> None:
         """`Seat.answer`, once where the same message is sent again because its reply was lost."""
         with self.session.changed:
             if key is None or self._heard.get(turn) != key:
-                seat.answer(turn, answer, seconds)
+                seat.answer(turn, *given)
                 self._heard[turn] = key
 
     async def _events(self, request: Request) -> Response:

@@ -25,7 +25,7 @@ class Sitting(Protocol):
         """Update who is present."""
         ...
 
-    def take(self, seat: "Seat", turn: int, answer: str, seconds: float | None) -> None:
+    def take(self, seat: "Seat", turn: int, answer: str, seconds: float | None, replays: int | None) -> None:
         """What `Seat.answer` does."""
         ...
 
@@ -82,16 +82,17 @@ class Seat:
                 raise TimeoutError(f"expected {' or '.join(phases)}, still {self.view['phase']}")
             return self.view
 
-    def answer(self, turn: int, answer: str, seconds: float | None = None) -> None:
+    def answer(self, turn: int, answer: str, seconds: float | None = None, replays: int | None = None) -> None:
         """Take the answer to the question of `turn`, or an undo there; it is on the disk when this returns.
 
-        The instructions are answered with "begin". What is answered to them and in practice is not kept.
+        The instructions are answered with "begin". What is answered to them and in practice is not kept. `seconds` is
+        how long the person took, and `replays` how often the clips began again.
 
         Raises:
-          Stale: the turn is over, or its question is not there yet; nothing has happened.
-          ValueError: no answer, a bad time, or nothing to take back; nothing has happened.
+          Stale: the turn or the session is over, or the question is not there yet; nothing has happened.
+          ValueError: no answer, a bad time or number of replays, or nothing to take back; nothing has happened.
         """
-        self.session.take(self, turn, answer, seconds)
+        self.session.take(self, turn, answer, seconds, replays)
 
     def set(self, view: View) -> None:
         """Show another view, and tell those who listen."""

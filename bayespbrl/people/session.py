@@ -9,8 +9,10 @@ Several people answer at once, each a question of their own (`seat`). After an a
 look at theirs, so that nobody waits for another; an answer may then be to a question of an earlier iteration.
 """
 
+import secrets
 import threading
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 from bayespbrl import checks, events
@@ -51,6 +53,7 @@ class Session:
 
     Attributes:
       seats: one for each person.
+      name: of this sitting, kept with each of its answers; it influences nothing.
       changed: locked while anything changes.
 
     Raises:
@@ -74,6 +77,7 @@ class Session:
         if not names or len(set(names)) < len(names):
             raise ValueError(f"answerer: expected a name for each person, got {names}")
         self.learner, self.most_answers = learner, most_answers
+        self.name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
         self.changed = threading.Condition(threading.RLock())
         known = {past.answerer for past in learner.state.past}
         self.seats = tuple(
@@ -142,9 +146,11 @@ class Session:
             if self._foresight.present is not before:
                 self._settle()
 
-    def take(self, seat: Seat, turn: int, answer: str, seconds: float | None) -> None:
+    def take(self, seat: Seat, turn: int, answer: str, seconds: float | None, replays: int | None) -> None:
         """What `Seat.answer` does."""
         with self.changed:
+            if self._closing:
+                raise Stale("session: expected an open one, got one that is closed")
             if turn != seat.turn or seat.view["phase"] not in (INSTRUCTIONS, QUESTION):
                 raise Stale(f"turn: expected {seat.turn}, got {turn}")
             if (introduction := self._introducing(seat)) is not None:
@@ -153,7 +159,7 @@ class Session:
             elif answer == Answer.UNDO:
                 self._undo(seat)
             else:
-                self._take(seat, answer, seconds)
+                self._take(seat, answer, {"seconds": seconds, "replays": replays})
             self._settle()
 
     def _turn(self, seat: Seat) -> None:
@@ -165,14 +171,14 @@ class Session:
         if not seat.view["undo"]:
             raise ValueError("undo: expected an answer of the same person's to take back, got none")
         number = self.learner.state.past[-1].number
-        self.learner.undo()
+        self.learner.undo(answerer=seat.answerer)
         self._turn(seat)
         self._foresight.back(number, self.learner.state, seat.answerer)
 
-    def _take(self, seat: Seat, answer: str, seconds: float | None) -> None:
+    def _take(self, seat: Seat, answer: str, how: dict[str, Any]) -> None:
         number, given = seat.number, parse_answer(answer)
         assert number is not None
-        self.learner.record(events.answered(number, given, answerer=seat.answerer, seconds=seconds))
+        self.learner.record(events.answered(number, given, answerer=seat.answerer, session=self.name, **how))
         self._turn(seat)
         moment = self._foresight.move(number, given, self.learner.state)
         try:
@@ -300,12 +306,15 @@ class Session:
         seat.set(views.with_question(view, shown, self._clips.rate(shown.clips)))
 
 
-def answer_of(message: Any) -> tuple[int, str, float | None]:
-    """Turn, answer and seconds of a message of the front end; `ValueError` where it is none."""
-    if not isinstance(message, dict) or not set(message) <= {"turn", "answer", "seconds"}:
-        raise ValueError("answer: expected turn, answer and seconds")
-    turn, answer, seconds = (message.get(name) for name in ("turn", "answer", "seconds"))
+def answer_of(message: Any) -> tuple[int, str, float | None, int | None]:
+    """Turn, answer, seconds and replays of a message of the front end; `ValueError` where it is none."""
+    names = ("turn", "answer", "seconds", "replays")
+    if not isinstance(message, dict) or not set(message) <= set(names):
+        raise ValueError("answer: expected turn, answer, seconds and replays")
+    turn, answer, seconds, replays = (message.get(name) for name in names)
     if type(turn) is not int or not isinstance(answer, str):
         raise ValueError(f"answer: expected the number of a turn and an answer, got {turn!r} and {answer!r}"[:200])
     checks.optional(checks.number, "seconds", seconds)
-    return turn, answer, seconds
+    if replays is not None and (type(replays) is not int or not 0 <= replays <= events.MOST_REPLAYS):
+        raise ValueError(f"replays: expected a whole number from 0 to {events.MOST_REPLAYS}")
+    return turn, answer, seconds, replays

@@ -12,7 +12,7 @@ from bayespbrl import checks
 from bayespbrl.preferences import Answer, PastQuestion, parse_answer
 from bayespbrl.runs.files import write_file
 
-COLUMNS = ("question", "first", "second", "answer", "answerer", "seconds", "repeats")
+COLUMNS = ("question", "first", "second", "answer", "answerer", "seconds", "repeats", "session", "replays")
 NEEDED = ("first", "second", "answer")
 
 
@@ -37,14 +37,16 @@ def write_answers(file: Path | str, past: Sequence[PastQuestion]) -> Path:
 
     The columns are `question`, its number; `first` and `second`, the numbers of the trajectories in the order shown;
     `answer`, one of first, second, tie and skip ("cannot tell"); `answerer`, `seconds` and `repeats`, the number of the
-    earlier question that it repeats, each empty where there is none.
+    earlier question that it repeats; `session`, of the sitting, and `replays`, how often the clips began again. The
+    last five are empty where they are not known.
     """
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(COLUMNS)
     for each in past:
-        known = ("" if value is None else value for value in (each.answerer, each.seconds, each.repeats))
-        writer.writerow([each.number, each.first, each.second, str(each.answer), *known])
+        known = (getattr(each, name) for name in COLUMNS[4:])
+        values = ("" if value is None else value for value in known)
+        writer.writerow([each.number, each.first, each.second, str(each.answer), *values])
     file = Path(file)
     try:
         write_file(file, table.getvalue())

@@ -87,17 +87,21 @@ class RunDirectory:
         except (TypeError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
 
+    def check_newest(self) -> None:
+        """`ValueError` where another learner has written to the run since this one's last event."""
+        if self._end is not None and self._end != self._log_size():
+            raise ValueError(
+                f"{self.path}: expected the run as this learner left it, but another learner has written to it; "
+                "resume the run to continue from there"
+            )
+
     def append(self, entry: Entry, state: LearnerState) -> None:
         """Write one event: first its heavy parts, then its line, flushed to the disk.
 
         Raises:
           ValueError: another learner has written to the run in the meantime; nothing is written then.
         """
-        if self._end is not None and self._end != self._log_size():
-            raise ValueError(
-                f"{self.path}: expected the run as this learner left it, but another learner has written to it; "
-                "resume the run to continue from there"
-            )
+        self.check_newest()
         if entry.parts:
             write_iteration(self.iteration_file(entry.event["iteration"]), entry)
         line = (json.dumps(dict(entry.event), allow_nan=False) + "\n").encode()

@@ -32,7 +32,8 @@ def people_section(contents: RunContents) -> Body:
     caption = (
         "Everyone who answered, with 90 % intervals. Lapse rate: the share of answers that are coin tosses. Side bias: "
         "how much better the trajectory shown first looks, in standard deviations of the utility differences. Same on "
-        "repeats: how many repeated questions were answered as before, with the exact interval of the share."
+        "repeats: how many repeated questions were answered as before, with the exact interval of the share. "
+        "Median time: the interval holds the median of all their answers, by order statistics; from five times on."
     )
     text = [f"{warning.what} {warning.remedy}" for warning in people_warnings(contents)]
     return text or ["No warnings about any person."], [Table(caption, head, rows)]
@@ -62,8 +63,11 @@ def _row(one: xr.Dataset, *, given: bool) -> list[str]:
     ]
     if given:
         inferred[0] = inferred[0].split(" ")[0] + " (set)"
+    time = "–" if np.isnan(seconds) else f"{seconds:.1f} s"
+    if not np.isnan(float(one["seconds_lower"])):
+        time += f" ({float(one['seconds_lower']):.1f} to {float(one['seconds_upper']):.1f})"
     counts = [str(int(one[name])) for name in ("answers", "ties", "cannot_tell")]
-    return [_name(one), *counts, *inferred, share, "–" if np.isnan(seconds) else f"{seconds:.1f} s"]
+    return [_name(one), *counts, *inferred, share, time]
 
 
 def _range(one: xr.Dataset, name: str) -> str:
