@@ -108,7 +108,6 @@ DEFAULT: dict[str, Any] = {
     "checked": True,
     "restart_iterations": 8,  # what the first policy misses, one that begins with the last posterior often finds
     "constant_utility": True,  # CartPole's answers are foreseen better
-    "diffusion_utility": True,  # the Gridworld's answers are foreseen better
     "critic_iterations": 4,  # on the hidden reward Pendulum forgets with all transitions
     "recent_iterations": 4,
     "update_states": 10_000,
