@@ -23,6 +23,8 @@ StateFeatures = Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"
 StateActionFeatures = Callable[[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
 
 ACTION_BANDWIDTH = 0.5  # of the action kernel, as a fraction of the action's range
+DIFFUSION_STEPS = 1 / 3  # the length scale of a diffusion basis as drawn: states are nearly independent
+MOST_CONNECTED = 1000  # discrete states of a diffusion basis; the eigenvectors of so many take a third of a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +80,37 @@ class RadialBasis:
         return radial_basis_under(
             multiples, points, self.centres, self.bandwidths, self.period, normalised=self.normalised
         )
+
+
+@dataclass(frozen=True, eq=False)
+class DiffusionBasis:
+    """φ(s) = V_s exp(−¼ b² Λ), divided by its length, for discrete states: VΛVᵀ is the Laplacian of a graph of them.
+
+    A linear function of φ with independent standard normal weights is a Gaussian process whose covariance is the
+    diffusion kernel exp(−½ b² L), scaled to a variance of one: states that few steps part have similar values. At b = 0
+    all states are independent, as with `OneHot`.
+
+    Attributes:
+      eigenvectors, eigenvalues: V and Λ.
+      bandwidths: b, the length scale in steps.
+
+    Source: Kondor and Lafferty (2002).
+    """
+
+    eigenvectors: Float[np.ndarray, "d d"]
+    eigenvalues: Float[np.ndarray, " d"]
+    bandwidths: Float[np.ndarray, "1"]
+
+    def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n d"]:
+        """Features of N integer observations."""
+        observations = indices("observations", observations, len(self.eigenvalues))
+        rows = self.eigenvectors * np.exp(-0.25 * self.bandwidths**2 * self.eigenvalues)
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        return rows[observations]
+
+    def rescaled(self, multiples: ArrayLike) -> Self:
+        """The same graph with a length scale `multiples` times as long."""
+        return replace(self, bandwidths=self.bandwidths * np.asarray(multiples))
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +175,7 @@ class RadialBasisOptions:
       normalised: as of `RadialBasis`; for φ(s) alone.
       constant: whether φ(s) has a constant feature too, which gives the utility of a state as much prior variance as
         the others give it in the mean. Then how long a trajectory is counts by itself.
+      diffusion: whether φ(s) of discrete states is a `DiffusionBasis` of the observed steps instead of one-hot.
     """
 
     centres: int
@@ -149,6 +183,7 @@ class RadialBasisOptions:
     period: ArrayLike | None = None
     normalised: bool = False
     constant: bool = False
+    diffusion: bool = False
 
     def __post_init__(self) -> None:
         whole("centres", self.centres)
@@ -183,6 +218,18 @@ def draw_state_features(
         return kernel
     variances = np.sum(kernel(kernel.centres) ** 2, axis=1)  # the centres are a sample of the states
     return replace(kernel, constant=float(np.sqrt(np.mean(variances))))
+
+
+def diffusion_basis(trajectories: Sequence[Trajectory], number_of_states: int) -> DiffusionBasis:
+    """That of the graph whose edges join two states where some trajectory stepped from one to the other."""
+    edges = np.zeros((number_of_states, number_of_states))
+    for trajectory in trajectories:
+        states = indices("states", trajectory.states, number_of_states)
+        edges[states[:-1], states[1:]] = 1.0
+    edges = np.maximum(edges, edges.T)
+    np.fill_diagonal(edges, 0.0)
+    eigenvalues, eigenvectors = np.linalg.eigh(np.diag(edges.sum(axis=1)) - edges)
+    return DiffusionBasis(eigenvectors, np.maximum(eigenvalues, 0.0), np.array([DIFFUSION_STEPS]))
 
 
 def draw_state_action_features(
@@ -250,6 +297,9 @@ class FeatureSource:
         if self.own is not None:
             own = self.own
             return lambda states: checked_features(own, states)
+        space = self.observation_space
+        if options.diffusion and isinstance(space, Discrete) and space.n <= MOST_CONNECTED:
+            return diffusion_basis(trajectories, int(space.n))
         if not any(trajectory.terminated for trajectory in trajectories):
             options = replace(options, constant=False)
         observed = np.concatenate([trajectory.states for trajectory in trajectories])

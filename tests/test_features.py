@@ -6,9 +6,11 @@ from dataclasses import fields, is_dataclass, replace
 import jax
 import numpy as np
 import pytest
+import scipy.linalg
 from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.features import (
+    DiffusionBasis,
     FeatureSource,
     JointRadialBasis,
     OneHot,
@@ -16,6 +18,7 @@ from bayespbrl.features import (
     RadialBasisOptions,
     StateActionProduct,
     checked_features,
+    diffusion_basis,
     draw_state_action_features,
     draw_state_features,
 )
@@ -35,6 +38,44 @@ def swinging_states(number, rng):
 
 def test_one_hot_marks_the_state():
     np.testing.assert_array_equal(OneHot(3)(np.array([2, 0])), [[0, 0, 1], [1, 0, 0]])
+
+
+def walk(*states, number=4):
+    """The diffusion basis of one trajectory through these of so many states."""
+    steps = len(states) - 1
+    trajectory = Trajectory(np.array(states), np.zeros(steps, int), np.zeros(steps), terminated=False)
+    return diffusion_basis([trajectory], number)
+
+
+def test_the_diffusion_basis_is_a_root_of_the_matrix_exponential_of_the_laplacian():
+    features = walk(0, 1, 2, 1, 1).rescaled([3.0])  # a length scale of one step; nothing is known of state 3
+    laplacian = np.array([[1, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 1, 0], [0, 0, 0, 0]])
+    kernel = scipy.linalg.expm(-0.5 * laplacian)
+    deviations = np.sqrt(np.diag(kernel))
+    basis = features(np.arange(4))
+    np.testing.assert_allclose(basis @ basis.T, kernel / np.outer(deviations, deviations), atol=1e-12)
+
+
+def test_without_a_length_scale_the_states_of_a_diffusion_basis_are_independent():
+    basis = walk(0, 1, 2, 3).rescaled([0.0])(np.array([3, 1, 0]))
+    np.testing.assert_allclose(basis @ basis.T, np.eye(3), atol=1e-12)
+
+
+def test_states_many_steps_apart_have_less_to_do_with_each_other_and_more_under_a_longer_scale():
+    basis = walk(0, 1, 2, 3)
+    near, far = ((lambda b: b @ b[0])(basis.rescaled([m])(np.arange(4))) for m in (3.0, 9.0))
+    assert np.all(np.diff(near) < 0)
+    assert np.all(far[1:] > near[1:])
+
+
+def test_a_source_draws_the_diffusion_basis_of_discrete_states_where_it_is_asked_for():
+    trajectory = Trajectory(np.array([0, 1, 2]), np.zeros(2, int), np.zeros(2), terminated=False)
+    source, rng = FeatureSource(Discrete(3), Discrete(2)), np.random.default_rng(0)
+    for diffusion, kind in ((True, DiffusionBasis), (False, OneHot)):
+        options = RadialBasisOptions(10, diffusion=diffusion)
+        assert isinstance(source.of_states([trajectory], options, rng=rng), kind)
+    large = FeatureSource(Discrete(2000), Discrete(2))
+    assert isinstance(large.of_states([trajectory], RadialBasisOptions(10, diffusion=True), rng=rng), OneHot)
 
 
 def test_one_hot_of_state_and_action_numbers_the_actions_within_a_state():

@@ -48,6 +48,7 @@ BAD = {
     "utility_bandwidth_factor": [0, -1.0, NAN],
     "normalised_utility": [None, 1, "yes"],
     "constant_utility": [None, 1, "yes"],
+    "diffusion_utility": [None, 1, "yes"],
     "preset": ["fast", "", None],
     "answers": [0, -1, 2.5, True],
     "same_start": [None, 1, "yes"],

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayespbrl.features import OneHot, RadialBasis
+from bayespbrl.features import DiffusionBasis, OneHot, RadialBasis
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.runs.stored_classes import STORED, from_tree, to_tree
 from bayespbrl.utility.estimate import FitQuality
@@ -88,6 +88,7 @@ def test_what_is_not_finite_comes_back(tmp_path):
     "instance",
     [
         OneHot(25),
+        DiffusionBasis(np.eye(3), np.arange(3.0), np.array([0.5])),
         RadialBasis(np.random.default_rng(1).normal(size=(4, 2)), np.array([0.3, 0.7]), np.array([np.inf, 6.28])),
         TabularPolicy(np.random.default_rng(2).dirichlet(np.ones(3), 5)),
         LinearGaussianPolicy(np.ones((1, 3)), np.zeros(2), np.ones(2), np.eye(1), np.ones(1), np.asarray(0.01)),

@@ -13,12 +13,13 @@ import jax
 import numpy as np
 import xarray as xr
 
-from bayespbrl.features import JointRadialBasis, OneHot, RadialBasis, StateActionProduct
+from bayespbrl.features import DiffusionBasis, JointRadialBasis, OneHot, RadialBasis, StateActionProduct
 from bayespbrl.policies import GaussianProcessPolicy, LinearGaussianPolicy, SoftmaxPolicy, TabularPolicy
 from bayespbrl.utility import FitQuality, KnownReward, LinearProgramUtility, PosteriorUtility
 
 # The names of our classes in files. A name never changes; the class may move to another module.
 STORED: dict[str, type] = {
+    "diffusion-basis": DiffusionBasis,
     "fit-quality": FitQuality,
     "gaussian-process": GaussianProcessPolicy,
     "joint-radial-basis": JointRadialBasis,

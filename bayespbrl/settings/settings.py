@@ -40,6 +40,8 @@ class Features:
         that the utility extends to states far from every compared trajectory, where plain ones fall to zero.
       constant_utility: whether the utility has a constant part, as of `RadialBasisOptions`, where some episodes end
         before the time limit.
+      diffusion_utility: whether the utility of discrete states is smooth over the steps that were observed, with a
+        length scale that is inferred, as of `DiffusionBasis`; else it has an independent value for each state.
     """
 
     features: str = "drawn"
@@ -48,13 +50,14 @@ class Features:
     utility_bandwidth_factor: float = 1.0
     normalised_utility: bool = True
     constant_utility: bool = False
+    diffusion_utility: bool = False
 
     def __post_init__(self) -> None:
         checks.one_of("features", self.features, ("drawn", "other"))
         checks.whole("centres", self.centres)
         checks.positive("bandwidth_factor", self.bandwidth_factor)
         checks.positive("utility_bandwidth_factor", self.utility_bandwidth_factor)
-        for name in ("normalised_utility", "constant_utility"):
+        for name in ("normalised_utility", "constant_utility", "diffusion_utility"):
             checks.boolean(name, getattr(self, name))
 
     @property
@@ -70,6 +73,7 @@ class Features:
             self.utility_bandwidth_factor,
             normalised=self.normalised_utility,
             constant=self.constant_utility,
+            diffusion=self.diffusion_utility,
         )
 
 

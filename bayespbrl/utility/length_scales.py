@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from bayespbrl.features import RadialBasis, StateFeatures, linear
+from bayespbrl.features import DiffusionBasis, RadialBasis, StateFeatures, linear
 from bayespbrl.trajectories import Trajectory, trajectory_features
 
 # The prior: a uniform distribution over these multiples of the bandwidths as given, in each dimension.
@@ -23,7 +23,7 @@ MOST_SETTINGS = 27  # beyond three dimensions, so many points of the grid: the e
 
 def settings(features: StateFeatures, *, inferred: bool, rng: np.random.Generator) -> Float[np.ndarray, "c s"]:
     """Multiples of the bandwidths of φ, one row for each of C settings; one row of ones where nothing is inferred."""
-    dimensions = len(features.bandwidths) if isinstance(features, RadialBasis) else 0
+    dimensions = len(features.bandwidths) if isinstance(features, RadialBasis | DiffusionBasis) else 0
     if not inferred or not dimensions:
         return np.ones((1, dimensions))
     if len(MULTIPLES) ** dimensions <= MOST_SETTINGS:
@@ -36,7 +36,7 @@ def settings(features: StateFeatures, *, inferred: bool, rng: np.random.Generato
 
 def rescaled(features: StateFeatures, multiples: ArrayLike) -> StateFeatures:
     """φ with `multiples` of its bandwidths, where it has any."""
-    return features.rescaled(multiples) if isinstance(features, RadialBasis) else features
+    return features.rescaled(multiples) if isinstance(features, RadialBasis | DiffusionBasis) else features
 
 
 def values_under(
