@@ -222,6 +222,8 @@ def test_a_run_of_an_earlier_version_which_tried_no_policy_goes_on(run, tmp_path
     last = max(number for number, line in enumerate(lines) if line["event"] == "collected")
     for line in lines:
         line.get("summary", {}).pop("kept", None)
+        for field in ("check", "kept", "bound", "value"):  # the event had none of them beside its summary
+            line.pop(field, None)
     (directory / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines[:last]))
     env = gymnasium.wrappers.TimeLimit(Slope(), 8)
     learner = bayespbrl.resume(directory, env=env)

@@ -118,6 +118,9 @@ class Known:
     def likelihood(self, number):
         return Logistic(4.0)
 
+    def tie_thresholds(self, number):
+        return None
+
 
 @pytest.mark.parametrize(
     ("draws", "sure", "worth", "likely"),
