@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -31,6 +32,7 @@ from bayespbrl.studies.baseline_trials import read_baseline
 from bayespbrl.studies.declaration import declared
 from bayespbrl.studies.processes import trial_processes
 from bayespbrl.studies.rows import row_of, run_trial
+from bayespbrl.studies.study import rounding
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "RESULTS.md"
@@ -38,7 +40,7 @@ STUDIES, EARLIER, PUBLISHED = HERE / "studies", HERE / "results", HERE / "publis
 # A trial that ends below has failed, in the earlier studies.
 EARLIER_FAILED = {"swing-up": -1300.0, "gridworld": 0.99 * 294.8125}
 TOLERANCE = 1e-5  # relative: the data have six digits
-EXACT_ITERATIONS = 2  # of a cell that is run again; a change of the software shows there, rounding does not yet
+EXACT_ITERATIONS = 2  # of a cell that is run again on another machine; rounding does not show there yet
 
 
 def committed() -> dict[str, StudyData]:
@@ -130,37 +132,44 @@ def cheapest(data: StudyData) -> RowData | None:
     return min(learned, key=lambda row: float(row.lines["seconds"].sum() / len(row.seeds)), default=None)
 
 
-def differences_of_a_cell(data: StudyData) -> list[str]:
-    """What differs where the first trial of the cheapest row is run again; empty where nothing does.
-
-    A study of another version is not run again: it would differ. Another processor rounds sums otherwise, and learning
-    makes much of it: what differs only after the first iterations is printed, and is no difference.
-    """
-    row = cheapest(data)
-    if row is None or data.description.get("version") != version("bayespbrl"):
-        return []
+def again(row: RowData) -> list[dict[str, Any]]:
+    """The iterations of the first trial of a row, run anew."""
     seed = row.seeds[0]
-    kept = row.lines[row.lines["seed"] == seed]
     with tempfile.TemporaryDirectory() as folder:
         learner = row_of(row.declared.env, Path(folder) / "row", row.declared.options, seed=seed)
         cell = replace(learner, baseline=row.declared.baseline)
         with trial_processes(1) as process:  # with as many threads as in a study: others round sums otherwise
             process.submit(run_trial, cell, seed).result()
-        again = (read_summary if cell.baseline is None else read_baseline)(cell.path(seed))["iterations"]
+        entries: list[dict[str, Any]]
+        entries = (read_summary if cell.baseline is None else read_baseline)(cell.path(seed))["iterations"]
+        return entries
+
+
+def differences_of_a_cell(data: StudyData) -> list[str]:
+    """What differs where the first trial of the cheapest row is run again; empty where nothing does.
+
+    A study of another version is not run again: it would differ. Another processor or library rounds sums otherwise,
+    and learning makes much of it: there, what differs only after the first iterations is printed, and is no difference.
+    """
+    row = cheapest(data)
+    if row is None or data.description.get("version") != version("bayespbrl"):
+        return []
+    seed, entries = row.seeds[0], again(row)
+    kept = row.lines[row.lines["seed"] == seed]
     where = f"study {data.name}, {row.declared.name}, seed {seed}"
-    names = ("answers", "value", "value_newest", "kl")
     found = [
         (entry["iteration"], f"{where}, iteration {entry['iteration']}: expected {name} {expected}, got {entry[name]}")
-        for entry, (_, line) in zip(again, kept.iterrows(), strict=False)
-        for name in names
+        for entry, (_, line) in zip(entries, kept.iterrows(), strict=False)
+        for name in ("answers", "value", "value_newest", "kl")
         if name in entry
         and not np.isclose(expected := float(line[name]), float(entry[name]), rtol=TOLERANCE, atol=1e-9)
     ]
-    if found and (first := found[0][0]) > EXACT_ITERATIONS:
-        print(f"{where}: iterations 1 to {first - 1} are as kept; from there on this processor's rounding shows.")
+    same = data.description.get("rounding") == rounding()  # studies that began before it was kept have none
+    if found and not same and (first := found[0][0]) > EXACT_ITERATIONS:
+        print(f"{where}: iterations 1 to {first - 1} are as kept; from there on this machine's rounding shows.")
         return []
-    if not found and len(again) != len(kept):
-        found = [(0, f"{where}: expected {len(kept)} iterations, got {len(again)}")]
+    if not found and len(entries) != len(kept):
+        found = [(0, f"{where}: expected {len(kept)} iterations, got {len(entries)}")]
     return [text for _, text in found]
 
 

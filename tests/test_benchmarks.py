@@ -208,10 +208,18 @@ def test_a_published_curve_stands_beside_the_values_after_as_many_answers():
 def test_a_cell_is_reproduced_and_another_value_is_found():
     page = benchmark("results_page")
     data = page.committed()["smoke"]
-    assert page.differences_of_a_cell(data) == []
     row = page.cheapest(data)
-    row.lines["value"] += 1.0
-    (first, *_) = page.differences_of_a_cell(data)
+    entries = page.again(row)
+    page.again = lambda row: entries
+    assert page.differences_of_a_cell(data) == []
+    row.lines.loc[row.lines["iteration"] == 5, "value"] += 1.0
+    data.description["rounding"] = page.rounding()
+    (later,) = page.differences_of_a_cell(data)
+    assert re.match(r"study smoke, gridworld/\S+, seed \d+, iteration 5: expected value ", later)
+    data.description["rounding"] = {"processor": "another"}
+    assert page.differences_of_a_cell(data) == []
+    row.lines.loc[row.lines["iteration"] == 1, "value"] += 1.0
+    first, *_ = page.differences_of_a_cell(data)
     assert re.match(r"study smoke, gridworld/\S+, seed \d+, iteration 1: expected value ", first)
 
 

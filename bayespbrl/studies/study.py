@@ -154,6 +154,7 @@ class Study:
             "source": source_digest(),
             "command": command,
             "machine": machine(),
+            "rounding": rounding(),
             "date": datetime.now(UTC).date().isoformat(),
             "trials": self.trials,
             "seed": self.declaration.seed,
@@ -236,6 +237,22 @@ def machine() -> str:
     processor = platform.processor() or platform.machine()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return f"{processor}, {cores} cores, Python {platform.python_version()}, jax {version('jax')}"
+
+
+def rounding() -> dict[str, str]:
+    """What decides how sums are rounded: the processor, and the versions of the numerical libraries.
+
+    Where all is the same a trial gives the same numbers; elsewhere its first iterations do, until rounding shows.
+    """
+    try:
+        lines = [line.partition(":") for line in Path("/proc/cpuinfo").read_text().splitlines()]
+    except OSError:
+        lines = []
+    known = {name.strip(): text.strip() for name, _, text in lines}
+    names = ("vendor_id", "cpu family", "model", "CPU implementer", "CPU part")  # two vocabularies: x86 and ARM
+    kind = [platform.machine(), *(f"{name} {known[name]}" for name in names if name in known)]
+    kind += sorted({"avx2", "avx512f"} & set(known.get("flags", "").split()))
+    return {"processor": ", ".join(kind)} | {name: version(name) for name in ("casadi", "jaxlib", "numpy", "scipy")}
 
 
 def source_digest() -> str:
