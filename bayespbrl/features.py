@@ -29,7 +29,7 @@ MOST_CONNECTED = 1000  # discrete states of a diffusion basis; the eigenvectors 
 
 @dataclass(frozen=True, eq=False)
 class OneHot:
-    """φ(s) = e_s for discrete states, which makes linear functions of the features exact."""
+    """φ(s) = e_s for discrete states: the paper's tabular model, in which linear functions are exact (step 1)."""
 
     number_of_states: int
 
@@ -94,7 +94,7 @@ class DiffusionBasis:
       eigenvectors, eigenvalues: V and Λ.
       bandwidths: b, the length scale in steps.
 
-    Source: Kondor and Lafferty (2002).
+    Source: Kondor & Lafferty (2002).
     """
 
     eigenvectors: Float[np.ndarray, "d d"]
@@ -104,7 +104,7 @@ class DiffusionBasis:
     def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Features of N integer observations."""
         observations = indices("observations", observations, len(self.eigenvalues))
-        rows = self.eigenvectors * np.exp(-0.25 * self.bandwidths**2 * self.eigenvalues)
+        rows = self.eigenvectors * np.exp(-0.25 * self.bandwidths**2 * self.eigenvalues)  # Kondor & Lafferty (2002)
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
         return rows[observations]
 
@@ -228,7 +228,7 @@ def diffusion_basis(trajectories: Sequence[Trajectory], number_of_states: int) -
         edges[states[:-1], states[1:]] = 1.0
     edges = np.maximum(edges, edges.T)
     np.fill_diagonal(edges, 0.0)
-    eigenvalues, eigenvectors = np.linalg.eigh(np.diag(edges.sum(axis=1)) - edges)
+    eigenvalues, eigenvectors = np.linalg.eigh(np.diag(edges.sum(axis=1)) - edges)  # Kondor & Lafferty (2002)
     return DiffusionBasis(eigenvectors, np.maximum(eigenvalues, 0.0), np.array([DIFFUSION_STEPS]))
 
 
@@ -341,7 +341,7 @@ def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "n ..
     """
     if features.shape[1] != len(weights):
         raise ValueError(f"features: expected {len(weights)} of each state, as before, got {features.shape[1]}")
-    return np.asarray(features @ weights)
+    return np.asarray(features @ weights)  # u = wᵀφ(s) (paper, step 2), wᵀψ(τ) (eq. 4)
 
 
 def _box(name: str, space: Space[Any]) -> Box:

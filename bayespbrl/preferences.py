@@ -287,7 +287,7 @@ def pair_differences(
         raise ValueError(f"pairs: expected trajectory numbers in 0 … {len(trajectory_features) - 1}, got {pairs}")
     if np.any(numbers[:, 0] == numbers[:, 1]):
         raise ValueError(f"pairs: expected two different trajectories in each, got {pairs}")
-    return trajectory_features[numbers[:, 0]] - trajectory_features[numbers[:, 1]]
+    return trajectory_features[numbers[:, 0]] - trajectory_features[numbers[:, 1]]  # eq. 5
 
 
 def same_starts(trajectories: Sequence[Trajectory]) -> list[list[int]]:

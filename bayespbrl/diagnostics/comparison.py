@@ -124,4 +124,4 @@ def _error_of_sum(values: np.ndarray) -> np.ndarray:
     if number < 2:
         return np.full(values.shape[0], np.nan)
     with np.errstate(invalid="ignore"):
-        return np.sqrt(number * np.var(values, axis=-1, ddof=1))
+        return np.sqrt(number * np.var(values, axis=-1, ddof=1))  # Vehtari et al. (2017), eq. 24

@@ -156,8 +156,8 @@ def _setting_move(
     points = settings.centre + settings.root @ whitened
     margins = jnp.einsum("skq,sq->sk", settings.loadings, points)
     log_p = log_likelihood(problem, unknowns, margins)
-    log_p -= 0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # log N(z; 0, σ²I)
-    log_p += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A|
+    log_p -= 0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # eq. 7: log N(z; 0, σ²I)
+    log_p += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A| (Green 1995)
     setting = random.categorical(key, log_p + problem.log_probabilities)
     return points[setting], unknowns._replace(setting=setting)
 
@@ -207,8 +207,8 @@ def _scaled(
     """
     scaled = jnp.any(problem.settings.loadings[unknowns.setting] != 0, axis=0)  # all but padding
     points = jnp.where(scaled, scales[:, None] * z, z)
-    log_p -= 0.5 * jnp.sum(points**2, axis=1) / problem.settings.prior_scale**2
-    chosen = random.categorical(key, log_p + jnp.sum(scaled) * jnp.log(scales))
+    log_p -= 0.5 * jnp.sum(points**2, axis=1) / problem.settings.prior_scale**2  # eq. 7: log N(z; 0, σ²I)
+    chosen = random.categorical(key, log_p + jnp.sum(scaled) * jnp.log(scales))  # Green (1995): the volume scale^r
     return points[chosen], chosen
 
 

@@ -61,6 +61,7 @@ def plain_draws(
         raise ValueError("plain draws: expected given length scales, steepness and lapse rate, got some to be inferred")
     number = settings.shape[1] if number_of_preferences is None else number_of_preferences
     fits = [fit_gaussian(settings[0], model, number_of_preferences=number)]
+    # paper, experiments: as many samples for the burn-in as for the evaluation
     half = draws // 2
     kept = min(half, KEPT)
     with jax.enable_x64(True), one_blas_thread():

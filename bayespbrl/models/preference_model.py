@@ -181,7 +181,7 @@ def preference_model(
     """
     number, dimension = differences.shape
     weights = numpyro.sample("utility_weights", dist.Normal(0, prior_scale).expand([dimension]).to_event(1))  # eq. 7
-    margins = numpyro.deterministic("margins", differences @ weights)
+    margins = numpyro.deterministic("margins", differences @ weights)  # eq. 5
     # eq. 8; rounding must not lift log p to 0 or above, where the logit is not a number
     log_p = jnp.minimum(log_prob(likelihood, margins), -1e-30)
     with numpyro.plate("preference", number), numpyro.handlers.mask(mask=used):

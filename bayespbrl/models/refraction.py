@@ -134,6 +134,7 @@ def flown(
     end = lax.while_loop(lambda now: (now.time < duration) & (now.events < most), to_next_wall, start)
     position, velocity = jnp.stack([y, velocity]) + end.kicks.T @ walls.normals
     cos, sin = np.cos(duration), np.sin(duration)
+    # Pakman & Paninski (2014): the motion under a standard normal distribution is a rotation
     return position * cos + velocity * sin, velocity * cos - position * sin, end.time < duration
 
 
@@ -160,6 +161,7 @@ def flight_move(
     def energy(y: Float[Array, " q"], velocity: Float[Array, " q"], margins: Float[Array, " c"]) -> Float[Array, ""]:
         return 0.5 * jnp.sum(y**2) + 0.5 * jnp.sum(velocity**2) - log_likelihood(margins)
 
+    # Metropolis test (Afshar & Domke 2015)
     lost = energy(y, velocity, margins) - energy(end, at_end, then)
     accepted = (jnp.log(random.uniform(key_test, dtype=y.dtype)) < lost) & ~given_up
     return jnp.where(accepted, end, y), jnp.where(accepted, then, margins), given_up

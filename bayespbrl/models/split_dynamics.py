@@ -52,6 +52,6 @@ def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProb
     last, _ = lax.scan(step, (x, velocity, value, gradient), None, length=GRADIENTS)
     end, at_end, then, _ = last
     gained = then - value + 0.5 * jnp.sum(x**2 + velocity**2) - 0.5 * jnp.sum(end**2 + at_end**2)
-    # NaN compares as false, so that it is rejected
+    # the Metropolis test of Shahbaba et al. (2014); NaN compares as false, so that it is rejected
     accepted = jnp.log(random.uniform(key_test, dtype=x.dtype)) < gained
     return jnp.where(accepted, centre + width * (problem.root @ end), z)

@@ -136,6 +136,7 @@ def _heights(problem: JointProblem) -> Float[Array, "a n"]:
     right, wrong = (log_prob(likelihood, jnp.full(rates.shape, sign * BESIDE)) for sign in (1, -1))
     given, violated = jnp.sum(problem.answerers, axis=1), jnp.arange(problem.answerers.shape[1] + 1)
     obeyed = given[:, None] - violated
+    # eq. 8 at margins near zero, and the prior of λ
     log_p = obeyed[..., None] * right + violated[:, None] * wrong + problem.lapse_rate.log_probabilities
     return logsumexp(log_p, axis=-1)
 

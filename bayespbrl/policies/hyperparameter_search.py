@@ -1,4 +1,4 @@
-"""Hyper-parameters of the Gaussian process policy by CMA-ES after each iteration (paper, experiments).
+"""Hyper-parameters of the Gaussian process policy by CMA-ES (Hansen & Ostermeier 2001; paper, experiments).
 
 Decision: the objective is the weighted predictive log-likelihood of two held-out halves, not the paper's training-set
 error, which cannot identify the noise variance. It is computed on a random subsample of bounded size and with few
@@ -153,6 +153,7 @@ def _cost(samples: OutputSamples, start: Hyperparameters, rng: np.random.Generat
             for train, test in folds:
                 mean, variance = _predict(whitened, samples, train, test, parameters)
                 errors = np.square(samples.targets[test] - mean)
+                # Rasmussen & Williams (2006), eq. 5.10, weighted
                 total += float(samples.weights[test] @ (0.5 * (errors / variance + np.log(2 * np.pi * variance))))
         except np.linalg.LinAlgError:
             return FAILED

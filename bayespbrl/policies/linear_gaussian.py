@@ -86,7 +86,7 @@ class LinearGaussianPolicy:
         )
 
     def entropy(self, observation: Float[AnyArray, " s"]) -> Float[Array, ""]:
-        """Differential entropy of π(·|s) in nats, the same at every observation."""
+        """Differential entropy of π(·|s) in nats, the same everywhere (Rasmussen & Williams 2006, section A.5)."""
         factor = jnp.asarray(self.factor)
         return 0.5 * len(factor) * jnp.log(2 * jnp.pi * jnp.e) + _half_log_determinant(factor)
 
@@ -96,7 +96,7 @@ class LinearGaussianPolicy:
         return np.tile(deviation, (len(np.asarray(observations)), 1))
 
     def kl_divergence(self, old: Self, observations: ArrayLike) -> Float[np.ndarray, " n"]:
-        """KL(self ‖ old) of the two normal distributions at each of N observations."""
+        """KL(self ‖ old) of two normal distributions at N observations (Rasmussen & Williams 2006, section A.5)."""
         new_factor, old_factor = np.asarray(self.factor), np.asarray(old.factor)
         difference = np.linalg.solve(old_factor, (self._means(observations) - old._means(observations)).T)
         ratio = np.linalg.solve(old_factor, new_factor)  # lower triangular: its squares sum to the trace term
@@ -130,7 +130,7 @@ class LinearGaussianPolicy:
         location, deviation = location_and_deviation(samples.observations, shares)
         scale = np.where(deviation > 0, deviation, 1.0)  # a constant dimension keeps a slope of zero
         standardised = (samples.observations - location) / scale
-        centre = shares @ samples.actions
+        centre = shares @ samples.actions  # eq. 14
         weighted = standardised * shares[:, None]
         gram = weighted.T @ standardised + RIDGE * np.eye(dimensions)
         slopes = np.linalg.solve(gram, weighted.T @ (samples.actions - centre)).T  # eq. 14

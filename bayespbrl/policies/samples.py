@@ -42,7 +42,7 @@ def weighted_samples(
     weights = _checked_weights("sample_weights", sample_weights, number)
     if base_weights is not None:
         base = _checked_weights("base_weights", base_weights, number)
-        weights = weights * base * (number / base.sum())
+        weights = weights * base * (number / base.sum())  # pᵢ = Wᵢwᵢ of eq. 14, times N
         if not weights.sum() > 0:
             raise ValueError("sample_weights: expected some mass where base_weights have some, got none")
     kept = weights > 0

@@ -89,7 +89,8 @@ def inducing_rows(
       weights: > 0.
       number: M; fewer rows come back where they already explain every candidate.
     """
-    keys = np.log(weights) + rng.gumbel(size=len(weights))  # the largest keys: a draw by weight without replacement
+    # Kool, van Hoof & Welling (2019): the largest keys are a draw by weight without replacement
+    keys = np.log(weights) + rng.gumbel(size=len(weights))
     size = min(CANDIDATES, len(points))
     chosen = np.sort(np.argpartition(-keys, size - 1)[:size])
     pool = points[chosen]
@@ -99,6 +100,7 @@ def inducing_rows(
     while len(pivots) < len(factors) and unexplained.max() > JITTER:
         rank = len(pivots)
         cumulative = np.cumsum(unexplained)
+        # Chen et al. (2023): a pivot drawn by the residual diagonal, then a column of the partial Cholesky factor
         pivot = int(np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right"))
         pivot = min(pivot, size - 1)
         column = squared_exponential(pool, pool[pivot : pivot + 1])[:, 0]

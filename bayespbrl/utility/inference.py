@@ -70,7 +70,7 @@ def estimate(
     if options.utility == "known-reward":
         returns = np.array([trajectory.total_reward for trajectory in comparisons.trajectories])
         ordered = [pair for pair, stated in zip(comparisons.pairs, comparisons.ordered, strict=True) if stated]
-        satisfied = sum(bool(returns[i] > returns[j]) for i, j in ordered)
+        satisfied = sum(bool(returns[i] > returns[j]) for i, j in ordered)  # eq. 6
         return KnownReward(FitQuality(True, "known reward", len(ordered), satisfied))
     if options.utility == "linear-program":
         return _by_linear_program(comparisons.feature_sums(features), comparisons, features)
@@ -138,7 +138,7 @@ def _by_linear_program(
     checks.finite("feature_sums", feature_sums)
     scaled, scale = normalised(comparisons.differences(feature_sums)[comparisons.ordered])
     program = linear_program(scaled)
-    satisfied = int(np.sum(scaled @ program.weights > 0))
+    satisfied = int(np.sum(scaled @ program.weights > 0))  # eq. 6
     quality = FitQuality(program.converged, program.status, len(scaled), satisfied)
     return LinearProgramUtility(features, program.weights / scale, comparisons.discount, quality, scale)
 
@@ -165,12 +165,12 @@ def _by_posterior(
         known = np.where(ordered[:, None], differences, 0.0)
         tree = plain_draws(known, model, draws=plain, seed=seed, number_of_preferences=int(ordered.sum()))
     parts = _parts(tree, method, seed)
-    margins = np.einsum("ckd,cd->k", differences, parts)
+    margins = np.einsum("ckd,cd->k", differences, parts)  # eq. 5
     quality = FitQuality(
         converged=bool(tree.attrs["converged"]),
         status="converged" if tree.attrs["converged"] else "the sampler did not converge within its cap of draws",
         pairs=int(comparisons.ordered.sum()),
-        pairs_satisfied=int(np.sum(margins[comparisons.ordered] > 0)),
+        pairs_satisfied=int(np.sum(margins[comparisons.ordered] > 0)),  # eq. 6
         rhat_max=float(tree.attrs["rhat_max"]),
         effective_sample_size_min=float(tree.attrs["effective_sample_size_min"]),
         log_evidence=float(tree.attrs["log_evidence"]),

@@ -74,7 +74,7 @@ def sums_under(
     sums = np.zeros((len(multiples), len(trajectories), functions + bool(features.constant)))
     for i, trajectory in enumerate(trajectories):
         discounts = discount ** np.arange(len(trajectory))
-        sums[:, i, functions:] = features.constant * discounts.sum()
+        sums[:, i, functions:] = features.constant * discounts.sum()  # eq. 1
         for start in range(0, len(trajectory), ROWS_AT_A_TIME):
             rows = slice(start, start + ROWS_AT_A_TIME)
             for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):
