@@ -148,7 +148,7 @@ class MarginExpert:
 
 
 def _preferred(first: float, second: float) -> Answer:
-    """By two returns; a tie where they are equal but for rounding."""
+    """The answer by two returns; a tie where they are equal but for rounding."""
     if abs(first - second) <= TIE_TOLERANCE * max(abs(first), abs(second)):
         return Answer.TIE
     return Answer.FIRST if first > second else Answer.SECOND

@@ -93,7 +93,7 @@ def radial_basis_under(
     *,
     normalised: bool = False,
 ) -> Iterator[tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]]:
-    """k under each row of multiples of the bandwidths in turn, and by what its rows are to be multiplied.
+    """k under each row of bandwidth multiples in turn, and the factor by which to multiply each of its rows.
 
     Both together are `radial_basis`; they are only good until the next. k is a product over dimensions, so that the
     exponentials are taken once for each multiple and dimension; rows in lexicographic order share what they begin with.

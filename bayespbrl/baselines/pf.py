@@ -94,7 +94,7 @@ def preferred_probability(margins: Float[np.ndarray, "..."], width: float = ERRO
 
 
 def log_likelihood(differences: Float[np.ndarray, "k s"]) -> Callable[[np.ndarray], Float[np.ndarray, " n"]]:
-    """Of N Gaussian points, whose directions are the utilities; rows are ψ(preferred) − ψ(other)."""
+    """Log likelihood of N Gaussian points, whose directions are the utilities; rows are ψ(preferred) − ψ(other)."""
 
     def of(points: Float[np.ndarray, "n s"]) -> Float[np.ndarray, " n"]:
         with np.errstate(divide="ignore"):

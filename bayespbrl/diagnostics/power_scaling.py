@@ -82,7 +82,9 @@ def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) ->
         return np.asarray(tree["posterior"]["margins"]), log_prior
     known = np.asarray(tree["constant_data"]["differences"])
     if known.ndim != 2:
-        raise ValueError("features: expected none for a posterior over several settings of the features")
+        raise ValueError(
+            f"features: expected None for a posterior over {len(known)} settings, got shape {np.shape(features)}"
+        )
     features = checks.matrix("features", features, columns=known.shape[1])
     basis = low_rank(known).basis
     inside = features @ basis

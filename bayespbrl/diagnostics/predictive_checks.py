@@ -27,7 +27,7 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
 
     Args:
       tree: what `sample_posterior` returned.
-      draws: at most so many draws of the posterior, evenly spaced.
+      draws: maximum number of draws of the posterior, evenly spaced.
       seed: of the simulated answers.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Step 2, its critic: from the utilities of transitions to Q, by LSTD (paper, "Step 2")."""
+"""Step 2, the critic: from the utilities of transitions to Q, by LSTD (paper, "Step 2")."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -17,7 +17,7 @@ TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for l
 RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
 CONSTANT = "constant Q: nothing to gain"
-PerSample = Float[np.ndarray, " n"]  # one number a sample
+PerSample = Float[np.ndarray, " n"]  # one number per sample
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def reps_weights_by_state(
     q, states, base = _checked_samples(q_values, states, base_weights, kl_bound)
     visits = np.bincount(states, weights=base)
     if np.any(visits == 0):
-        raise ValueError(f"states: expected each of 0 … {len(visits) - 1}, got none of {np.argmin(visits)}")
+        raise ValueError(f"states: expected each of 0 … {len(visits) - 1}, got no {np.argmin(visits)}")
     means = np.bincount(states, weights=base * q) / visits
     spread = np.sqrt(base @ (q - means[states]) ** 2)
     constant = not spread > 1e-8 * np.max(np.abs(q))
@@ -264,7 +264,8 @@ def _checked_samples(
     for name, array in (("q_values", q_values), ("state_features", states), ("base_weights", base_weights)):
         checks.finite(name, array)
     if np.any(base_weights <= 0) or abs(np.sum(base_weights) - 1) > 1e-6:
-        raise ValueError(f"base_weights: expected positive entries with sum 1, got sum {np.sum(base_weights)}")
+        least, total = np.min(base_weights), np.sum(base_weights)
+        raise ValueError(f"base_weights: expected positive entries with sum 1, got least {least:g} and sum {total:g}")
     return q_values, states, base_weights
 
 

@@ -84,7 +84,7 @@ class ProposedUpdate:
         of the mean Q. That takes no solution of REPS.
         """
         if self.q_draws is None:
-            raise ValueError("gains: expected a utility estimate with a posterior, got one without")
+            raise ValueError(f"gains: expected Q under posterior draws, got q_draws={self.q_draws}")
         if kl_bound is None:
             promised = advantages(self.q_values, self.constraint, self.base_weights)  # eq. 12 at small bounds
             return np.asarray((self.base_weights * promised) @ self.q_draws)
@@ -124,7 +124,7 @@ class Improvement:
       updates: how many there were.
       kl_fitted_policy: mean KL of the new policy from the old one over the states of the updates, nats.
       entropy: mean entropy of the new policy over the same states, nats.
-      action_standard_deviation: mean of the new policy's over the same states, one number an action dimension, in the
+      action_standard_deviation: mean of the new policy's over the same states, one number per action dimension, in the
         action's units; None for discrete actions.
     """
 

@@ -124,7 +124,7 @@ def elliptical_moves(
 def independent_move(
     key: PRNGKeyArray, x: Float[Array, " n"], ellipse: Ellipse, *, candidates: int
 ) -> Float[Array, " n"]:
-    """The first of so many independent draws of the ellipse's Gaussian that lies on the slice; `x` where none does.
+    """The first of `candidates` independent draws of the ellipse's Gaussian on the slice; `x` where none is.
 
     Given the slice's height, the target's conditional distribution is that Gaussian restricted to the slice, and
     whether a draw falls into it does not depend on `x`: the move is exact. It goes anywhere at once, in few dimensions.

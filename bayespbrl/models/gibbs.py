@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, PRNGKeyArray, Shaped
 from bayespbrl.models.likelihoods import Likelihood, Margins, Scalar, Values, WithLapses, WithTies, has_steps, log_prob
 from bayespbrl.models.preference_problem import PreferenceProblem
 
-# Up to so many answers, padding included, nothing is spared: their moves are others.
+# Up to this many answers, padding included, the sampler makes more moves of other kinds.
 FEW = 64
 STACKED = ("loadings", "used", "centre", "site_precisions", "root", "inverse_root")
 
@@ -54,7 +54,7 @@ class JointProblem(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """The unknowns beside the weights: index of the setting and of each grid's value."""
+    """The unknowns besides the weights: index of the setting and of each grid's value."""
 
     setting: Int[Array, "*chains"]
     steepness: Int[Array, "*chains"]

@@ -243,7 +243,7 @@ class WithTies:
 
 
 def has_steps(likelihood: Likelihood) -> bool:
-    """Whether it jumps, as eq. 8 does. Given many answers the posterior of any other is nearly Gaussian."""
+    """Whether the likelihood jumps, as eq. 8 does. Given many answers the posterior of any other is nearly Gaussian."""
     if isinstance(likelihood, WithTies):
         return has_steps(likelihood.ordered)
     return has_steps(likelihood.attentive) if isinstance(likelihood, WithLapses) else isinstance(likelihood, Mixed)

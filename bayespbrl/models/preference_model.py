@@ -72,7 +72,7 @@ class PreferenceModel:
         """
         tied = np.zeros(number_of_preferences, dtype=bool) if indifferent is None else np.asarray(indifferent)
         if tied.ndim != 1 or tied.dtype != bool:
-            raise ValueError(f"indifferent: expected a vector of bool, got {tied.dtype} of shape {tied.shape}")
+            raise ValueError(f"indifferent: expected bool of shape (K,), got {tied.dtype} of shape {tied.shape}")
         threshold = self.tie_threshold is not None or indifferent is not None
         return likelihood_of(
             self.likelihood,
@@ -89,7 +89,7 @@ class Answers:
     """Ties, sides and answerers of K answers; None where they are not known.
 
     Attributes:
-      indifferent, shown_first, answerers: as of `sample_posterior`, shape (K,).
+      indifferent, shown_first, answerers: as in `sample_posterior`, shape (K,).
       names: of the answerers, by number; None: found in `answerers`, or there is one answerer.
     """
 

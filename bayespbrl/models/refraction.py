@@ -93,7 +93,7 @@ def flown(
       walls: where the likelihood jumps.
       margins: at the start.
       violated: answers of each answerer at the start.
-      heights: log likelihood of so many violated answers, for each answerer.
+      heights: log likelihood by the number of violated answers, for each answerer.
       duration: in (0, π), radians.
     """
     number, squares = len(walls.normals), jnp.diagonal(walls.products)
@@ -148,7 +148,7 @@ def flight_move(
     heights: Float[Array, "a n"],
     log_likelihood: Callable[[Float[Array, " c"]], Float[Array, ""]],
 ) -> tuple[Float[Array, " q"], Float[Array, " c"], Bool[Array, ""]]:
-    """y and its margins after one flight with a fresh velocity, and whether that was given up; arguments as of `flown`.
+    """y and its margins after one flight with a fresh velocity, and whether that was given up; arguments as in `flown`.
 
     The flight conserves prior × velocities × `heights`, and volumes; the test makes of it the law of `log_likelihood`,
     a function of the margins.

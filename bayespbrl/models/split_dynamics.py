@@ -27,7 +27,7 @@ def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProb
     margins_at_centre = problem.loadings @ centre
 
     def residual(x: Float[Array, " q"]) -> Float[Array, ""]:
-        """log(posterior / reference) up to a constant, as of `reference_ellipse`."""
+        """log(posterior / reference) up to a constant, as in `reference_ellipse`."""
         displacement = width * (problem.root @ x)
         margins = problem.loadings @ displacement
         log_likelihood = total_log_prob(problem.likelihood, margins_at_centre + margins, problem.used)

@@ -35,7 +35,7 @@ class Steps(NamedTuple):
 
     Attributes:
       walls: of each setting, stacked.
-      heights: log likelihood of so many violated answers of each answerer, whatever their lapse rate.
+      heights: log likelihood by the number of violated answers of each answerer, with the lapse rate summed out.
       ladder: of each setting, stacked; None: lapse rates move alone.
     """
 
@@ -98,7 +98,7 @@ def _transport_move(
     walls: Walls,
     ladder: Ladder,
 ) -> tuple[Float[Array, " q"], Unknowns]:
-    """The lapse rate of one answerer drawn anew with the quantiles of the weights kept."""
+    """Draw a new lapse rate for one answerer, keeping the quantiles of the weights."""
     key_who, key_value = random.split(key)
     rates = problem.lapse_rate.values
     who = random.randint(key_who, (), 0, len(problem.answerers))

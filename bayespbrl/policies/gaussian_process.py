@@ -1,4 +1,4 @@
-"""The Gaussian process policy (paper, step 2, "Obtaining a new exploration policy"): weighted, sparse, one a dimension.
+"""The Gaussian process policy (paper, "Obtaining a new exploration policy"): weighted, sparse, one per dimension.
 
 a_j ~ N(mean_j(s), var_j(s)) in each action dimension j, not clipped. The prior mean is the centre of the action's
 range; far from all samples the policy returns to it, and to the variance s² + σ².
@@ -43,7 +43,7 @@ class GaussianProcessPolicy:
       period: infinite where not periodic.
       minimum_noise: lower bound of σ as a fraction of the action's range.
       fits: how many fits led here; zero for the initial policy.
-      objective: of the last hyper-parameter search, a unit of weight; NaN where there was none.
+      objective: of the last hyper-parameter search, per unit of weight; NaN where there was none.
       noise_at_bound: whether the last search left σ² on a bound.
     """
 
@@ -76,7 +76,7 @@ class GaussianProcessPolicy:
 
         Args:
           period: of each observation dimension, infinite where not periodic; None for none.
-          initial_scale: standard deviation as a multiple of the range high − low, one number or one a dimension.
+          initial_scale: standard deviation as a multiple of the range high − low, one number or one per dimension.
           number_of_inducing_points: M.
           minimum_noise: the noise σ never falls below this fraction of the range.
         """
@@ -113,7 +113,7 @@ class GaussianProcessPolicy:
             return correlations @ mean_weights, jnp.sum(jnp.square(reduction @ correlations))
 
         mean, explained = jax.vmap(one)(self.inducing_points, self.bandwidths, self.mean_weights, self.reduction)
-        # Snelson & Ghahramani (2006), predictive mean and variance, as of `SparseRegression`
+        # Snelson & Ghahramani (2006), predictive mean and variance, as in `SparseRegression`
         variance = jnp.asarray(self.signal_variance) * jnp.maximum(1.0 - explained, 0.0) + self.noise_variance
         return jnp.asarray(self.action_centre) + mean, variance
 

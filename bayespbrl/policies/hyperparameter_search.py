@@ -17,7 +17,7 @@ from bayespbrl.policies.sparse_regression import inducing_rows, inverse_factor, 
 
 SUBSAMPLE, INDUCING_POINTS = 800, 50  # what the objective is computed with
 FAILED = 1e10  # the cost of hyper-parameters at which the linear algebra breaks down
-PerSample = Float[np.ndarray, " n"]  # one number a sample
+PerSample = Float[np.ndarray, " n"]  # one number per sample
 Logarithms = Float[np.ndarray, " p"]  # of the hyper-parameters searched
 
 
@@ -44,7 +44,7 @@ class OutputSamples:
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
-    """Of one output: bandwidths in the observation's units, variances in the action's units squared."""
+    """Hyper-parameters of one output: bandwidths in the observation's units, variances in the action's squared."""
 
     bandwidths: Float[np.ndarray, " s"]
     signal_variance: float
@@ -70,7 +70,7 @@ class SearchResult:
 
     Attributes:
       hyperparameters: the best ones seen, the start included.
-      objective: their log-likelihood a unit of weight (nats).
+      objective: their log-likelihood per unit of weight (nats).
       at_bound: whether the best noise variance lies on one of its bounds.
     """
 

@@ -16,7 +16,7 @@ from bayespbrl.policies.policy import AnyArray
 from bayespbrl.policies.samples import location_and_deviation, weighted_samples
 from bayespbrl.policies.spaces import centre_and_range, dimension, initial_deviation
 
-RIDGE = 1e-8  # a unit of weight, in standardised features: decides only what the samples leave open
+RIDGE = 1e-8  # per unit of weight, in standardised features: decides only what the samples leave open
 
 
 @jax.tree_util.register_dataclass
@@ -50,7 +50,7 @@ class LinearGaussianPolicy:
     ) -> Self:
         """The same normal distribution everywhere, about the centre of the action's range.
 
-        `initial_scale` is its standard deviation as a multiple of the range high − low, one number or one a dimension.
+        `initial_scale` is its standard deviation in multiples of the range high − low, one number or one per dimension.
         """
         states, actions = dimension("observation_space", observation_space), dimension("action_space", action_space)
         centre, width = centre_and_range("action_space", action_space)

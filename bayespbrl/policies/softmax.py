@@ -44,7 +44,7 @@ class SoftmaxPolicy:
       prior_scale: prior standard deviation of each logit's three parts.
       fits: how many fits led here.
       converged: whether the last fit reached its optimum; true of the initial policy.
-      newton_decrement: twice what the last fit has left to gain, by its quadratic model; nats a unit of weight.
+      newton_decrement: twice what the last fit has left to gain, by its quadratic model; nats per unit of weight.
     """
 
     intercepts: Float[AnyArray, " a"]

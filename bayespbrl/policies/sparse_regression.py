@@ -1,4 +1,4 @@
-"""Weighted sparse Gaussian process regression: FITC with the noise σ²/wᵢ a sample.
+"""Weighted sparse Gaussian process regression: FITC with the noise σ²/wᵢ of each sample.
 
 FITC: Snelson and Ghahramani (2006), Sparse Gaussian processes using pseudo-inputs. Weights: Kober, Oztop and Peters
 (2010), Reinforcement learning to adjust robot movements to new situations. Everything is written in v(x) = L⁻¹r(x),
@@ -19,7 +19,7 @@ from bayespbrl.kernels import squared_exponential
 
 JITTER = 1e-8  # relative to the signal variance; the kernel's rounding errors are near 1e-14
 CANDIDATES = 2000  # rows among which the inducing points are chosen
-PerSample = Float[np.ndarray, " n"]  # one number a sample
+PerSample = Float[np.ndarray, " n"]  # one number per sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def fit_sparse_regression(
 def inducing_rows(
     points: Float[np.ndarray, "n e"], weights: PerSample, number: int, *, rng: np.random.Generator
 ) -> Int[np.ndarray, " m"]:
-    """Rows of `points` to induce from: where the weight lies, and no two where one would do.
+    """Rows of `points` as inducing points: where the weight lies, and no two where one would do.
 
     Randomly pivoted Cholesky (Chen, Epperly, Tropp and Webber 2023): each next row is drawn in proportion to the prior
     variance that the rows before it leave unexplained, among `CANDIDATES` rows drawn in proportion to their weight.

@@ -58,10 +58,10 @@ class PosteriorUtility:
         return replace(self, posterior=DataTree.from_dict({"posterior": few}))
 
     def likelihood(self, number: int | None = None) -> Likelihood:
-        """Of the next answer given its margin under each of S draws: margins have shape (S, n).
+        """Likelihood of the next answer given its margin under each of S draws; margins have shape (S, n).
 
         Args:
-          number: as of `trajectory_draws`.
+          number: as in `trajectory_draws`.
         """
         drawn, fitted = self.posterior.children["posterior"].dataset, self.posterior.attrs
         apart = slice(None, None, self._apart(number))
@@ -76,7 +76,7 @@ class PosteriorUtility:
         )
 
     def tie_thresholds(self, number: int | None = None) -> Float[np.ndarray, "s 1"] | None:
-        """The tie threshold of each of S draws, as of `likelihood`; None where no answer was a tie."""
+        """The tie threshold of each of S draws, as in `likelihood`; None where no answer was a tie."""
         drawn = self.posterior.children["posterior"].dataset
         if "tie_threshold" not in drawn:
             return None
@@ -124,7 +124,7 @@ class PosteriorUtility:
         return np.array([(each[:1] - each[1:]) / scale for each, scale in zip(sums, self.scales, strict=True)])
 
     def hyperparameters(self) -> dict[str, Any]:
-        """Mean and 90 % interval of all that was inferred beside the weights, as plain data.
+        """Mean and 90 % interval of all that was inferred besides the weights, as plain data.
 
         Of several answerers the lapse rate is that of `next_lapse_rates`, and the side bias is the mean.
         """
