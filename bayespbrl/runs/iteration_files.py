@@ -89,7 +89,7 @@ def _check_numbers(tree: xr.DataTree) -> None:
     for node in tree.subtree:
         for name, variable in node.data_vars.items():
             if variable.dtype.kind not in "biuf":
-                raise ValueError(f"expected numbers as {name}, got {variable.dtype}")
+                raise ValueError(f"{variable.dtype} instead of numbers as {name}")
 
 
 def _trajectories_dataset(trajectories: Sequence[Trajectory]) -> xr.Dataset:
@@ -118,7 +118,7 @@ def _trajectories_dataset(trajectories: Sequence[Trajectory]) -> xr.Dataset:
 def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
     states, actions, rewards = data["states"].values, data["actions"].values, data["rewards"].values
     if np.any(data["length"].values > actions.shape[1]):
-        raise ValueError(f"expected at most {actions.shape[1]} steps, got {data['length'].values.max()}")
+        raise ValueError(f"a trajectory of {data['length'].values.max()} steps in a table of {actions.shape[1]}")
     return tuple(
         Trajectory(
             states[i, : length + 1], actions[i, :length], rewards[i, :length], bool(data["terminated"].values[i])
@@ -148,7 +148,7 @@ def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Seq
         given["posterior"] = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
     if utility.attrs.get("features") == "other":
         if features is None:
-            raise ValueError("features: expected those that the run was started with, as features=, got none")
+            raise ValueError("an estimate with features of your own: pass them again as features=")
         given["features"] = features
     if "class" not in utility.attrs:  # by an earlier version: the posterior's groups say which of two it is
         numbers = {name: float(utility.attrs[name]) for name in ("discount", "scale") if name in utility.attrs}
