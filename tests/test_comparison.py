@@ -7,7 +7,7 @@ from scipy.special import expit
 from bayespbrl.diagnostics import compare_likelihoods, plot_comparison, predictions
 from bayespbrl.models import PreferenceModel, posterior_draws
 
-SAMPLING = {"num_warmup": 250, "num_samples": 500, "max_samples": 500}
+SAMPLING = {"num_warmup": 50, "num_samples": 250, "max_samples": 250}
 FEW = {"num_warmup": 25, "num_samples": 25, "max_samples": 25}  # where any draws will do
 # one pair asked about five times; one answer contradicts the others
 ROWS = np.array([[0.5], [0.5], [-0.5], [0.5], [0.5]])

@@ -81,9 +81,9 @@ def test_a_policy_is_tried_without_its_noise_from_starts_that_all_policies_share
     tried, kept = run.learner.state.tried, run.learner.state.best_tried
     for trajectory, other in zip(tried, kept, strict=True):
         np.testing.assert_array_equal(trajectory.states[0], other.states[0])
-    policy = run.last_policy.policy
+    mode = jax.jit(run.last_policy.policy.mode)
     for trajectory in tried:
-        actions = [policy.mode(state) for state in trajectory.states[:-1]]
+        actions = [mode(state) for state in trajectory.states[:-1]]
         np.testing.assert_allclose(trajectory.actions, np.clip(actions, -1, 1), atol=1e-4)  # outside float64
     observation = np.array([0.1, -0.2])
     assert all(run.policy.act(observation) == run.policy.act(observation) for _ in range(3))
@@ -201,7 +201,7 @@ jax.tree_util.register_static(Plain)
 
 
 def test_a_policy_without_a_mode_is_tried_and_kept_with_its_noise():
-    learner = Learner(Slope(), policy=Plain(), answers=2, **FAST).run(ReturnExpert())
+    learner = Learner(Slope(), policy=Plain(), answers=2, restart_iterations=1, **FAST).run(ReturnExpert())
     assert learner.iterations[-1]["kept"] > 0
     assert isinstance(learner.policy, Plain)
     actor = Actor(learner.policy, Slope.action_space, np.random.default_rng(0), observation_shape=(2,))
@@ -258,7 +258,7 @@ class Unseeded(Slope):
 
 @pytest.mark.slow
 def test_an_environment_that_no_seed_resets_is_compared_across_starts():
-    learner = Learner(Unseeded(), answers=3, same_start=True, **FAST).run(ReturnExpert())
+    learner = Learner(Unseeded(), answers=3, same_start=True, restart_iterations=1, **FAST).run(ReturnExpert())
     assert learner.comparable_starts is False
     assert learner.preferences.answers == 3
     assert Learner(Unseeded(), answers=3, **FAST).comparable_starts is None  # not asked for

@@ -11,6 +11,9 @@ OWN = {"03_uncertainty_and_exploration": ["cautious"], "04_your_own_environment"
 # An absolute path of two parts or more (not an address), or one with a drive's letter.
 MACHINE_PATH = re.compile(r"(?<![\w.:/)])/\w[\w.-]*/\w[^\s\"]*|\b[A-Z]:\\\\\w+")
 
+# An empty namespace, and as few collections of garbage as in the test processes.
+BEFORE = "%reset -f\n__import__('gc').set_threshold(100_000, 20, 1_000)"
+
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
@@ -57,7 +60,7 @@ def test_every_notebook_runs_from_an_empty_namespace_without_error_or_warning(pa
     nbformat.validate(notebook)
     for cell in code_cells(notebook):
         cell.outputs = []
-    notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f"))
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(BEFORE))
     client = NotebookClient(notebook, km=kernel, timeout=300)
     client.execute()
     client.kc.stop_channels()
