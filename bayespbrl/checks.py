@@ -74,7 +74,7 @@ def short_name(name: str, value: Any) -> str:
 
 
 def finite(name: str, values: Any) -> None:
-    """That an array holds no NaN and no infinity."""
+    """Check that an array holds neither NaN nor infinity."""
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
 

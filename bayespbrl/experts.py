@@ -106,6 +106,7 @@ class Teacher:
             return Answer.TIE
         seen = [_discounted_from_the_end(each.rewards, self.discount) for each in (first, second)]
         answer = _preferred(*seen)
+        # Lee et al. (2021), section 3: Bradley & Terry (1952) with β
         wrong = 0.0 if np.isinf(self.rationality) else expit(-self.rationality * abs(seen[0] - seen[1]))
         # wrong either by chance or by mistake; both at once are right
         wrong = wrong * (1 - self.mistakes) + (1 - wrong) * self.mistakes
@@ -137,6 +138,7 @@ class MarginExpert:
     def error_probability(self, difference: float) -> float:
         """Probability of a wrong answer where the returns differ by `difference`."""
         share = min(abs(difference) / self.width, 1.0)
+        # Akrour et al. (2014), section 3.2
         return 0.5 - share / 2 * (1 - np.log(share)) if share else 0.5
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
@@ -146,7 +148,7 @@ class MarginExpert:
 
 
 def _preferred(first: float, second: float) -> Answer:
-    """By two returns; a tie where they are equal but for rounding."""
+    """The answer by two returns; a tie where they are equal but for rounding."""
     if abs(first - second) <= TIE_TOLERANCE * max(abs(first), abs(second)):
         return Answer.TIE
     return Answer.FIRST if first > second else Answer.SECOND

@@ -29,7 +29,7 @@ MOST_CONNECTED = 1000  # discrete states of a diffusion basis; the eigenvectors 
 
 @dataclass(frozen=True, eq=False)
 class OneHot:
-    """φ(s) = e_s for discrete states, which makes linear functions of the features exact."""
+    """φ(s) = e_s for discrete states: the paper's tabular model, in which linear functions are exact (step 1)."""
 
     number_of_states: int
 
@@ -66,13 +66,13 @@ class RadialBasis:
         return np.pad(basis, ((0, 0), (0, 1)), constant_values=self.constant) if self.constant else basis
 
     def rescaled(self, multiples: ArrayLike) -> Self:
-        """The same centres with bandwidths `multiples` times as wide, one number or one a dimension."""
+        """The same centres with bandwidths `multiples` times as wide, one number or one per dimension."""
         return replace(self, bandwidths=self.bandwidths * np.asarray(multiples))
 
     def under(
         self, multiples: Float[np.ndarray, "c s"], observations: ArrayLike
     ) -> Iterator[tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]]:
-        """`rescaled(row)(observations)` for each row of `multiples` in turn, as of `radial_basis_under`.
+        """`rescaled(row)(observations)` for each row of `multiples` in turn, as in `radial_basis_under`.
 
         The constant feature is not among them.
         """
@@ -94,7 +94,7 @@ class DiffusionBasis:
       eigenvectors, eigenvalues: V and Λ.
       bandwidths: b, the length scale in steps.
 
-    Source: Kondor and Lafferty (2002).
+    Source: Kondor & Lafferty (2002).
     """
 
     eigenvectors: Float[np.ndarray, "d d"]
@@ -104,7 +104,7 @@ class DiffusionBasis:
     def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Features of N integer observations."""
         observations = indices("observations", observations, len(self.eigenvalues))
-        rows = self.eigenvectors * np.exp(-0.25 * self.bandwidths**2 * self.eigenvalues)
+        rows = self.eigenvectors * np.exp(-0.25 * self.bandwidths**2 * self.eigenvalues)  # Kondor & Lafferty (2002)
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
         return rows[observations]
 
@@ -140,7 +140,7 @@ class JointRadialBasis:
         observations = matrix("observations", observations, columns=states.centres.shape[1])
         actions = matrix("actions", actions, columns=self.action_centres.shape[1])
         if len(observations) != len(actions):
-            raise ValueError(f"actions: expected {len(observations)} rows, one an observation, got {len(actions)}")
+            raise ValueError(f"actions: expected {len(observations)} rows, one for each state, got {len(actions)}")
         clipped = np.clip(actions, self.action_low, self.action_high)
         return radial_basis(  # a product of exponentials is one exponential over both
             np.hstack([observations, clipped]),
@@ -169,10 +169,10 @@ class RadialBasisOptions:
     """How radial basis functions are drawn at observed samples.
 
     Attributes:
-      centres: how many, drawn without replacement; at most one a sample is.
+      centres: how many, drawn without replacement; at most one per sample.
       bandwidth_factor: multiplies the median rule.
       period: of each observation dimension, infinite where not periodic; None for none.
-      normalised: as of `RadialBasis`; for φ(s) alone.
+      normalised: as in `RadialBasis`; for φ(s) alone.
       constant: whether φ(s) has a constant feature too, which gives the utility of a state as much prior variance as
         the others give it in the mean. Then how long a trajectory is counts by itself.
       diffusion: whether φ(s) of discrete states is a `DiffusionBasis` of the observed steps instead of one-hot.
@@ -221,14 +221,14 @@ def draw_state_features(
 
 
 def diffusion_basis(trajectories: Sequence[Trajectory], number_of_states: int) -> DiffusionBasis:
-    """That of the graph whose edges join two states where some trajectory stepped from one to the other."""
+    """The basis of the graph that joins two states where some trajectory stepped from one to the other."""
     edges = np.zeros((number_of_states, number_of_states))
     for trajectory in trajectories:
         states = indices("states", trajectory.states, number_of_states)
         edges[states[:-1], states[1:]] = 1.0
     edges = np.maximum(edges, edges.T)
     np.fill_diagonal(edges, 0.0)
-    eigenvalues, eigenvectors = np.linalg.eigh(np.diag(edges.sum(axis=1)) - edges)
+    eigenvalues, eigenvectors = np.linalg.eigh(np.diag(edges.sum(axis=1)) - edges)  # Kondor & Lafferty (2002)
     return DiffusionBasis(eigenvectors, np.maximum(eigenvalues, 0.0), np.array([DIFFUSION_STEPS]))
 
 
@@ -256,7 +256,7 @@ def draw_state_action_features(
     states = matrix("states", states, columns=_box("observation_space", observation_space).shape[0])
     actions = matrix("actions", actions, columns=box.shape[0])
     if len(states) != len(actions):
-        raise ValueError(f"actions: expected {len(states)} rows, one a state, got {len(actions)}")
+        raise ValueError(f"actions: expected {len(states)} rows, one for each state, got {len(actions)}")
     kernel, chosen = options.state_kernel(states, rng)
     low, high = box.low.astype(np.float64), box.high.astype(np.float64)
     bounded = np.isfinite(high) & np.isfinite(low)
@@ -340,8 +340,8 @@ def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "n ..
       ValueError: features of another length than the weights, as a function of the user's may return.
     """
     if features.shape[1] != len(weights):
-        raise ValueError(f"features: expected {len(weights)} of each state, as before, got {features.shape[1]}")
-    return np.asarray(features @ weights)
+        raise ValueError(f"features: expected {len(weights)} for each state, as before, got {features.shape[1]}")
+    return np.asarray(features @ weights)  # u = wᵀφ(s) (paper, step 2), wᵀψ(τ) (eq. 4)
 
 
 def _box(name: str, space: Space[Any]) -> Box:

@@ -1,9 +1,9 @@
 """The squared-exponential kernel with periodic dimensions, and the median rule for its bandwidths.
 
 k(x, z) = exp(−½ Σⱼ δⱼ²/bⱼ²), with δⱼ = xⱼ − zⱼ, or, in a dimension of period P, the chord δⱼ = P/π · sin(π(xⱼ − zⱼ)/P):
-the kernel over (cos, sin) on a circle of circumference P, which agrees with the plain one over short distances. A
-dimension of bandwidth zero is left out. Coordinates in which the chord is an ordinary Euclidean distance turn every
-kernel matrix into one matrix product.
+the kernel over (cos, sin) on a circle of circumference P, which agrees with the plain one over short distances
+(Rasmussen & Williams 2006, eqs. 4.9 and 4.31). A dimension of bandwidth zero is left out. Coordinates in which the
+chord is an ordinary Euclidean distance turn every kernel matrix into one matrix product.
 """
 
 from collections.abc import Iterator
@@ -36,6 +36,7 @@ def coordinates(points: Float[np.ndarray, "n s"], period: Float[np.ndarray, " s"
     """Points in the kernel's Euclidean coordinates: plain dimensions, then P/2π·cos, then P/2π·sin."""
     periodic = np.isfinite(period)
     radius = period[periodic] / (2 * np.pi)
+    # Rasmussen & Williams (2006), eq. 4.31, by (cos, sin)
     angles = points[:, periodic] / radius
     return np.concatenate([points[:, ~periodic], radius * np.cos(angles), radius * np.sin(angles)], axis=1)
 
@@ -62,7 +63,7 @@ def squared_exponential(
         if normalised:  # the nearest centre's is exp(0), so that the sum is never zero, however far the point
             block -= block.max(axis=1, keepdims=True)
         np.minimum(block, 0.0, out=block)
-        np.exp(block, out=block)
+        np.exp(block, out=block)  # Rasmussen & Williams (2006), eq. 4.9
         if normalised:
             block /= block.sum(axis=1, keepdims=True)
     return kernel
@@ -92,12 +93,13 @@ def radial_basis_under(
     *,
     normalised: bool = False,
 ) -> Iterator[tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]]:
-    """k under each row of multiples of the bandwidths in turn, and by what its rows are to be multiplied.
+    """k under each row of bandwidth multiples in turn, and the factor by which to multiply each of its rows.
 
     Both together are `radial_basis`; they are only good until the next. k is a product over dimensions, so that the
     exponentials are taken once for each multiple and dimension; rows in lexicographic order share what they begin with.
     """
     squares = _squares(points, centres, bandwidths, period)
+    # Rasmussen & Williams (2006), eq. 4.9, one factor for each dimension
     factors = [
         {multiple: np.exp(square / (-2 * multiple**2)) for multiple in np.unique(column)}
         for square, column in zip(squares, multiples.T, strict=True)
@@ -142,6 +144,7 @@ def radial_basis_row(point: Vector, centres: Rows, bandwidths: Vector, period: V
     bandwidths = jnp.asarray(bandwidths)
     inverse = jnp.where(bandwidths > 0, 1 / jnp.where(bandwidths > 0, bandwidths, 1.0), 0.0)
     difference = _on_circles(jnp.asarray(point), period) - _on_circles(jnp.asarray(centres), period)
+    # Rasmussen & Williams (2006), eq. 4.9
     return jnp.exp(-0.5 * jnp.sum(jnp.square(difference * jnp.tile(inverse, 2)), axis=-1))
 
 
@@ -152,7 +155,7 @@ def _on_circles(points: Float[Array, "*b s"], period: Vector) -> Float[Array, "*
     """
     periodic = jnp.isfinite(period)
     radius = jnp.where(periodic, period, 1.0) / (2 * jnp.pi)  # no infinity inside: its gradient would be NaN
-    angles = points / radius
+    angles = points / radius  # Rasmussen & Williams (2006), eq. 4.31
     first = jnp.where(periodic, radius * jnp.cos(angles), points)
     return jnp.concatenate([first, jnp.where(periodic, radius * jnp.sin(angles), 0.0)], axis=-1)
 

@@ -67,7 +67,9 @@ class Learner:
         if policy is not None and not isinstance(policy, str | Policy):
             raise ValueError(f"policy: expected a policy (bayespbrl.policies) or a kind by name, got {policy!r}")
         if "environment" in options:
-            raise ValueError("settings: expected env alone to say which environment, got environment too")
+            raise ValueError(
+                f"environment: expected the environment as env only, got environment={options['environment']!r} too"
+            )
         own_policy = None if policy is None or isinstance(policy, str) else policy
         self.settings: Settings = kept or settings_for(
             env if isinstance(env, str) else environment_name(self.environment),
@@ -201,10 +203,12 @@ class Learner:
     def _take_in(self, answers: Sequence[Answer | str], answerer: str | None, seconds: float | None) -> None:
         waiting = self._waiting()
         if isinstance(answers, str) or not isinstance(answers, Sequence) or len(answers) != len(waiting):
-            raise ValueError(f"tell: expected a list of {len(waiting)} answers, one a question, got {answers!r}")
+            raise ValueError(f"tell: expected a list of {len(waiting)} answers, one to each question, got {answers!r}")
         parsed = [parse_answer(answer) for answer in answers]
         if Answer.UNDO in parsed and len(parsed) > 1:
-            raise ValueError("tell: expected undo() where several questions wait, got an undo among their answers")
+            raise ValueError(
+                f"tell: expected undo() while several questions wait, got an undo among the answers {answers!r}"
+            )
         numbers = [query.number for query in waiting]
         entries = [
             events.answered(number, answer, answerer=answerer, seconds=seconds)
@@ -275,7 +279,9 @@ class Learner:
         try:
             from bayespbrl.people.widget import ComparisonWidget  # here, since people stand above the learner
         except ImportError as error:
-            raise ValueError(f"the widget needs the extra people: pip install 'bayespbrl[people]' ({error})") from error
+            raise ValueError(
+                f"widget: expected the extra people (pip install 'bayespbrl[people]'), got {error}"
+            ) from error
         return ComparisonWidget(self, most_answers=answers, answerer=answerer, practice=practice)
 
     def _waiting(self) -> list[Query]:
@@ -314,5 +320,5 @@ def _chosen(option: str, given: Choice | str | None, name: str, known: Mapping[s
     if given is not None and not isinstance(given, str):
         return given
     if name not in known:
-        raise ValueError(f"{option}: expected a function of the user's own beside {name!r}, got none")
+        raise ValueError(f"{option}: expected a function, because the settings say {name!r}, got none")
     return known[name]

@@ -63,7 +63,7 @@ class PastQuestion(NamedTuple):
     """A question with its answer.
 
     Attributes:
-      number, first, second, newcomer, repeats: as of `Query`.
+      number, first, second, newcomer, repeats: as in `Query`.
       answer: `FIRST`, `SECOND`, `TIE` or `SKIP`.
       answerer, seconds: who gave it, and how long they took; None: not known.
       session: of the sitting, the same for all its answers; None: not known.
@@ -183,7 +183,7 @@ class Preferences:
             of the two.
         """
         if rivals is None and (not self.undominated or incumbent != self.undominated[-1]):
-            raise ValueError(f"incumbent: expected the newest undominated of {self.undominated}, got {incumbent}")
+            raise ValueError(f"incumbent: expected the last of the undominated {self.undominated}, got {incumbent}")
         if preferred not in (None, newcomer, incumbent):
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
         beside = self.undominated if rivals is None else tuple(each for each in rivals if each in self.undominated)
@@ -287,7 +287,7 @@ def pair_differences(
         raise ValueError(f"pairs: expected trajectory numbers in 0 … {len(trajectory_features) - 1}, got {pairs}")
     if np.any(numbers[:, 0] == numbers[:, 1]):
         raise ValueError(f"pairs: expected two different trajectories in each, got {pairs}")
-    return trajectory_features[numbers[:, 0]] - trajectory_features[numbers[:, 1]]
+    return trajectory_features[numbers[:, 0]] - trajectory_features[numbers[:, 1]]  # eq. 5
 
 
 def same_starts(trajectories: Sequence[Trajectory]) -> list[list[int]]:

@@ -69,6 +69,7 @@ QueryRule = Callable[[QuerySituation], Sequence[int]]
 def highest_utility(situation: QuerySituation) -> list[int]:
     """The trajectory of highest expected utility wᵀψ(τ) first, equal ones in their order: the paper's rule."""
     new = [situation.trajectories[number] for number in situation.new]
+    # paper, step 4: the highest expected utility first
     order = np.argsort(-situation.estimate.trajectory_utilities(new), kind="stable")
     return [situation.new[index] for index in order]
 
@@ -207,7 +208,7 @@ def expected_information(
     """
     utilities, opponents = _fitting_draws(utilities, opponents)
     p = prob(likelihood, utilities - opponents)
-    # the estimate from the same draws is never negative but for rounding
+    # Houlsby et al. (2011), eq. 2; the estimate from the same draws is never negative but for rounding
     return np.maximum(_entropy(p.mean(axis=0)) - _entropy(p).mean(axis=0), 0.0)
 
 

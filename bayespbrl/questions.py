@@ -62,7 +62,7 @@ class Questions:
         for name in ("same_start", "worthwhile"):
             checks.boolean(name, getattr(self, name))
         if self.same_start and self.clip_steps is not None:
-            raise ValueError("same_start: expected false with clip_steps, parts that begin anywhere, got true")
+            raise ValueError("same_start: expected false with clip_steps, because clips begin at any step, got true")
 
     def clips(self, trajectories: Sequence[Trajectory], *, rng: np.random.Generator) -> list[list[int]] | None:
         """First step and number of steps of the part of each trajectory that is compared; None: all of it."""
@@ -84,11 +84,11 @@ class Questions:
         return signal is None or (estimate.quality.converged and signal >= UNASKED_SIGNAL)
 
     def within_budget(self, wanted: int, answers: int) -> int:
-        """As many of `wanted` answers as the budget has left after so many."""
+        """`wanted`, or what the budget has left after `answers` if that is less."""
         return int(max(0, min(wanted, self.left(answers))))
 
     def left(self, answers: int) -> float:
-        """How many answers the budget has left after so many."""
+        """How many answers the budget has left after `answers`."""
         return math.inf if self.answers is None else self.answers - answers
 
 
@@ -112,7 +112,7 @@ class Chosen:
 def first_questions(
     new: Sequence[int], opponents: Mapping[int, int], options: Questions, *, rng: np.random.Generator
 ) -> Chosen:
-    """Random ones, before there is an estimate to choose by (paper, step 4); with opponents, each pair once."""
+    """Random questions, before there is an estimate to choose by (paper, step 4); with opponents, each pair once."""
     wanted = options.within_budget(options.first_queries, 0)
     pairs = [number for number in new if opponents.get(number, number) < number]
     candidates = random_candidates(pairs or new, rng=rng)
@@ -120,7 +120,7 @@ def first_questions(
 
 
 def later_questions(rule: QueryRule, situation: QuerySituation, options: Questions, *, answers: int) -> Chosen:
-    """Those of `rule`, after so many answers; none where the best is not worth asking."""
+    """The questions that `rule` chooses after `answers` answers; none where the best is not worth asking."""
     order, opponents, information = candidates(rule, situation), None, None
     if options.same_start:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)

@@ -1,4 +1,4 @@
-"""Step 3: policy × environment → trajectories (paper, figure 1), compiled where the environment is pure functions.
+"""Step 3: policy × environment → trajectories (paper, step 3), compiled where the environment is pure functions.
 
 An environment with pure functions (`env.unwrapped.dynamics`) and a policy that is a JAX pytree run as one compiled
 `lax.scan` over all episodes at once. Anything else is stepped through the ordinary gymnasium interface: as a vector
@@ -40,7 +40,7 @@ __all__ = ["Returns", "open_environment", "returns", "rollout", "step_limit"]
 
 @dataclass(frozen=True)
 class Returns:
-    """Evaluation of a policy, one entry an episode.
+    """Evaluation of a policy, one entry per episode.
 
     Attributes:
       total: undiscounted sum of the environment's reward.
@@ -141,7 +141,7 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
     for limit in limits:
         if limit is not None:
             return int(limit)
-    raise ValueError(f"environment {environment_name(env)} states no time limit: expected max_steps, got None")
+    raise ValueError(f"max_steps: expected a number, because {environment_name(env)} has no time limit, got None")
 
 
 def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episodes: int, max_steps: int | None) -> int:
@@ -298,7 +298,7 @@ def _act(
 def _act_one_by_one(
     policy: Sampler, key: Key[Array, ""], counter: int, observations: Shaped[np.ndarray, "n ..."]
 ) -> Shaped[np.ndarray, "n ..."]:
-    """For a policy that is an ordinary Python object."""
+    """Actions of a policy that is an ordinary Python object."""
     keys = jax.random.split(jax.random.fold_in(key, counter), len(observations))
     return np.stack([np.asarray(policy.sample(*pair)) for pair in zip(keys, observations, strict=True)])
 

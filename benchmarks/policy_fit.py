@@ -42,7 +42,7 @@ def relative_entropy_weights(values: np.ndarray, base: np.ndarray) -> np.ndarray
     """p/W ∝ exp(value/η) with KL(p ‖ W) = KL_BOUND, shape (N,); mean one under W."""
 
     def weights(log_temperature: float) -> np.ndarray:
-        unscaled = np.exp((values - values.max()) / np.exp(log_temperature))
+        unscaled = np.exp((values - values.max()) / np.exp(log_temperature))  # eq. 12
         return unscaled / (base @ unscaled)
 
     def excess(log_temperature: float) -> float:

@@ -26,7 +26,7 @@ def log_likelihood(margins: np.ndarray, *, steepness: float) -> np.ndarray:
     number = margins.shape[1]
     smooth = log_expit(steepness * margins)
     step = np.where(margins > 0, np.log(max(number - 1, 1e-300)), -np.inf)
-    log_p = np.logaddexp(step, smooth) - np.log(number)
+    log_p = np.logaddexp(step, smooth) - np.log(number)  # eq. 8
     return np.sum(np.where(margins == 0, np.log(0.5), log_p), axis=1)
 
 
@@ -41,7 +41,7 @@ def tempered(
     while power < 1:
         new = next_power(value, power)
         weights = (new - power) * value
-        evidence += logsumexp(weights) - np.log(particles)
+        evidence += logsumexp(weights) - np.log(particles)  # Del Moral et al. (2006): ratio of normalising constants
         weights = np.exp(weights - logsumexp(weights))
         chosen = np.searchsorted(np.cumsum(weights), (np.arange(particles) + rng.uniform()) / particles)
         z, value = z[np.minimum(chosen, particles - 1)], value[np.minimum(chosen, particles - 1)]
@@ -64,7 +64,7 @@ def next_power(value: np.ndarray, power: float) -> float:
     for _ in range(50):
         middle = (low + high) / 2
         weights = (middle - power) * value
-        survivors = np.exp(2 * logsumexp(weights) - logsumexp(2 * weights))
+        survivors = np.exp(2 * logsumexp(weights) - logsumexp(2 * weights))  # effective sample size (Kish 1965)
         low, high = (middle, high) if survivors > len(value) / 2 else (low, middle)
     return 1.0 if high > 1 - 1e-6 else low
 

@@ -76,6 +76,7 @@ class People:
         """1 the first shown, −1 the second, 0 no difference."""
         lapsed, tossed, drawn = rng.random((3, len(margins)))
         margins = margins + np.array(self.biases)[who]
+        # Bradley & Terry (1952), with the threshold of Rao & Kupper (1967)
         first, second = (expit(self.steepness * (side * margins - self.threshold)) for side in (1, -1))
         answer = np.where(drawn < first, 1, np.where(drawn < first + second, -1, 0))
         return np.where(lapsed < np.array(self.lapse_rates)[who], np.where(tossed < 0.5, 1, -1), answer)

@@ -124,6 +124,7 @@ def _log_likelihood(
 
 
 def _of_answers(likelihood: Likelihood, margins: np.ndarray, threshold: Any, tied: np.ndarray) -> np.ndarray:
+    # Rao & Kupper (1967): p(tie) = 1 − p(t − δ) − p(−t − δ)
     above, below = prob(likelihood, margins - threshold), prob(likelihood, -margins - threshold)
     return np.asarray(np.sum(np.log(np.maximum(np.where(tied, 1 - above - below, above), 1e-300)), axis=-1))
 
@@ -265,7 +266,7 @@ def report(rows: Sequence[Ranks]) -> None:
     p_values = {}
     for name, values in found.items():
         counts, _ = np.histogram(values, bins=10, range=(0, 1))
-        p_values[name] = float(stats.chisquare(counts).pvalue)
+        p_values[name] = float(stats.chisquare(counts).pvalue)  # Talts et al. (2018): ranks are uniform
         print(f"{name:22} n = {len(values):4}  p = {p_values[name]:.3g}  {counts.tolist()}", flush=True)
     print(f"smallest p × {len(p_values)} = {min(1.0, min(p_values.values()) * len(p_values)):.3g}")
 

@@ -366,8 +366,8 @@ def test_whoever_mostly_tosses_coins_is_to_be_dropped_and_who_often_does_to_be_t
     assert drop[0].startswith("Ada: 70 % of the answers look like coin tosses")
     assert drop[1] == "Drop them. run.estimate_without('Ada') infers the utility without them."
     assert trust[0].startswith("Bob: 30 % of the answers look like coin tosses")
-    assert trust[1].startswith("Trust them less: the posterior already does.")
-    assert [remedy for _, remedy in advised(answers[:1], {"Ada": surely})] == ["Ask someone else, and start anew."]
+    assert trust[1].startswith("The posterior already trusts them less.")
+    assert [remedy for _, remedy in advised(answers[:1], {"Ada": surely})] == ["Start a new run with someone else."]
 
 
 def test_whoever_contradicts_themselves_is_asked_again_and_who_cannot_tell_is_shown_more():
@@ -456,8 +456,8 @@ def test_a_utility_is_inferred_from_answers_collected_elsewhere(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("first,second\n0,1\n", "expected the columns first, second, answer, got none named answer"),
-        ("", "got none named first, second, answer"),
+        ("first,second\n0,1\n", "expected the columns first, second, answer, got first, second"),
+        ("", "expected the columns first, second, answer, got none"),
         ("first,second,answer\n0,1,first\n0,x,first\n", "line 3: invalid literal"),
         ("first,second,answer\n0,-1,first\n", "line 2: second: expected a whole number >= 0"),
         ("first,second,answer\n0,0,first\n", "line 2: expected an answer about two different things"),

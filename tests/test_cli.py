@@ -145,7 +145,7 @@ def test_resuming_draws_the_pictures_that_a_finished_run_lacks(monkeypatch, caps
 
 
 def test_nobody_answers_for_an_expert_of_the_users_own(monkeypatch, capsys, tmp_path):
-    assert "expert: expected return, page or terminal, got other" in refused(
+    assert "expert: expected a simulated expert, page or terminal, got other" in refused(
         monkeypatch, capsys, "run", "gridworld", *QUICK, "--expert", "other", "--out", tmp_path / "run"
     )
     assert not (tmp_path / "run").exists()

@@ -67,10 +67,10 @@ def test_a_strangers_run_imports_no_package_unless_told(monkeypatch, capsys, tmp
     (tmp_path / "strangers_package.py").write_text(PACKAGE)
     monkeypatch.syspath_prepend(tmp_path)
     of_another_environment(gridworld_copy, name)
-    assert "not imported unless you say so" in refused(monkeypatch, capsys, "resume", gridworld_copy)
+    assert "expected permission to import" in refused(monkeypatch, capsys, "resume", gridworld_copy)
     with pytest.raises(ValueError, match="import_package=True"):
         bayespbrl.load(gridworld_copy)
-    assert "imported only with" in damage_of(gridworld_copy)
+    assert "expected permission to import" in damage_of(gridworld_copy)
     assert "strangers_package" not in sys.modules
     if name.startswith("strangers"):
         with pytest.raises(SystemExit, match="this was imported"):

@@ -206,7 +206,9 @@ def test_a_policy_without_a_mode_is_tried_and_kept_with_its_noise():
     assert isinstance(learner.policy, Plain)
     actor = Actor(learner.policy, Slope.action_space, np.random.default_rng(0), observation_shape=(2,))
     assert actor.act(np.zeros(2)) != actor.act(np.zeros(2))
-    with pytest.raises(ValueError, match="deterministic: expected a policy with a method mode, got Plain"):
+    with pytest.raises(
+        ValueError, match="deterministic: expected a policy with a method mode or probabilities, got Plain"
+    ):
         actor.predict(np.zeros((1, 2)), deterministic=True)
 
 

@@ -130,7 +130,7 @@ def test_a_policy_is_started_anew_once_and_what_was_kept_is_remembered():
         update.event["summary"].update(checked, kept=kept)
         assert apply(state, update).kept_policy == policy
     for history in ((anew,), (*HISTORY, anew, improved(3), anew)):
-        with pytest.raises(ValueError, match="collected: expected a policy to be started anew once"):
+        with pytest.raises(ValueError, match="collected: expected at most one restart"):
             replay(begun, history)
 
 

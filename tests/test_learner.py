@@ -716,14 +716,14 @@ def test_a_run_follows_a_query_rule_of_the_users_own_and_goes_on_with_it(tmp_pat
     begun = start("gridworld", tmp_path / "run", query=newest_first, **QUICK)
     while len(begun.iterations) < 2:
         begun.tell([ReturnExpert()(*query.trajectories) for query in begun.ask()])
-    with pytest.raises(ValueError, match=r"a run with query of the user's own: expected it again as query="):
+    with pytest.raises(ValueError, match=r"expected query= again, which the run was started with, got None"):
         resume(tmp_path / "run")
     whole = resume(tmp_path / "run", query=newest_first).run(ReturnExpert())
     asked = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     newcomers = [event["newcomer"] for event in asked if event["event"] == "asked"]
     assert newcomers[2:] == [19, 29]
     assert load(tmp_path / "run").iterations == whole.iterations  # reading needs no rule
-    with pytest.raises(ValueError, match="query: expected a function of the user's own beside 'other', got none"):
+    with pytest.raises(ValueError, match="query: expected a function, because the settings say 'other', got none"):
         Learner("gridworld", query="other")
 
 

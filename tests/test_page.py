@@ -479,7 +479,7 @@ def test_ten_megabytes_are_not_read(gridworld):
 
 
 def test_a_port_in_use_is_refused(gridworld):
-    with pytest.raises(ValueError, match=f"port {gridworld.port} on 127.0.0.1: cannot listen"):
+    with pytest.raises(ValueError, match=f"expected an address to listen on, got '127.0.0.1' and {gridworld.port}"):
         Page(Session(bayespbrl.Learner("gridworld", **QUICK)), port=gridworld.port)
 
 

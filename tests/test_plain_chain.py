@@ -35,13 +35,15 @@ def test_a_long_plain_chain_has_the_posterior_and_a_short_one_says_that_it_has_n
 
 
 def test_plain_draws_need_everything_else_given():
-    with pytest.raises(ValueError, match="plain draws: expected given length scales"):
+    with pytest.raises(
+        ValueError, match="plain draws: expected one setting of the length scales, a steepness and a lapse rate, got "
+    ):
         plain_draws(DIFFERENCES, PreferenceModel(steepness=None), draws=40, seed=0)
     with pytest.raises(ValueError, match="draws: expected a whole number >= 16"):
         plain_draws(DIFFERENCES, MODEL, draws=10, seed=0)
-    with pytest.raises(ValueError, match="hyperparameters: expected given with plain_draws"):
+    with pytest.raises(ValueError, match="hyperparameters: expected 'given' with plain_draws, got 'inferred'"):
         Estimation(plain_draws=200)
-    with pytest.raises(ValueError, match="plain_draws: expected a given steepness and lapse_rate"):
+    with pytest.raises(ValueError, match="plain_draws: expected numbers as steepness and lapse_rate, got "):
         Settings.from_options("gridworld", {"plain_draws": 200, "hyperparameters": "given", "steepness": None})
     kept = Settings.from_options("gridworld", {"plain_draws": 200, "hyperparameters": "given"})
     assert kept.options()["plain_draws"] == 200

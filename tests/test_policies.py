@@ -287,8 +287,11 @@ def test_one_sample_is_enough(kind):
         (lambda s, a, w: (s, a, np.append(w[1:], -1.0)), "sample_weights: expected finite"),
         (lambda s, a, w: (s, a, np.zeros_like(w)), "sample_weights: expected at least one positive"),
         (lambda s, a, w: (s, a, w[1:]), r"sample_weights: expected shape \(9,\), got \(8,\)"),
-        (lambda s, a, w: (s[1:], a, w), "actions: expected one row"),
-        (lambda s, a, w: (s[:0], a[:0], w[:0]), "at least one observation"),
+        (lambda s, a, w: (s[1:], a, w), "actions: expected as many rows as observations, at least one, got 9 and 8"),
+        (
+            lambda s, a, w: (s[:0], a[:0], w[:0]),
+            "actions: expected as many rows as observations, at least one, got 0 and 0",
+        ),
         (lambda s, a, w: (s * np.nan, a, w), "observations: expected"),
         (lambda s, a, w: (s, a * np.nan, w), "actions: expected"),
         (lambda s, a, w: (s[:, None], a, w), "observations: expected"),
@@ -305,7 +308,7 @@ def test_bad_samples_are_named(spoil, message):
 
 
 def test_base_weights_without_mass_under_the_weights_are_refused():
-    with pytest.raises(ValueError, match="sample_weights: expected some mass"):
+    with pytest.raises(ValueError, match="sample_weights: expected a positive weight where"):
         initial("tabular").fit(np.array([0, 1]), np.array([0, 1]), np.array([1.0, 0]), base_weights=np.array([0, 1.0]))
 
 

@@ -170,10 +170,10 @@ def test_the_summary_has_the_value_and_the_convergence_of_the_posterior(page, co
 @pytest.mark.parametrize(("kept", "of"), [(1, "the earlier one of iteration 1"), (3, "the one of iteration 3")])
 def test_the_report_says_that_a_policy_was_started_anew_and_which_is_kept(contents, kept, of):
     report = assembled(changed(contents, [{}, {}, {"restarted": 2, "kept": kept}]))
-    said = f"After iteration 2 a policy was started anew with the last posterior; the run keeps {of}."
+    said = f"After iteration 2 the policy was restarted with the last posterior; the run keeps {of}."
     assert said in report.summary
     (learning,) = [section for section in report.sections if section.name == "learning"]
-    assert "begins again where a policy was started anew; the last" in str(learning.blocks)
+    assert "begins again where the policy was restarted; the last" in str(learning.blocks)
 
 
 def test_every_answer_is_drawn_with_both_trajectories_and_its_probability(page, contents):
@@ -270,7 +270,7 @@ def test_a_run_keeps_the_posterior_over_length_scales_and_the_report_says_what_i
         low, high = (number(found[f"{name} {end}"]) for end in ("lower", "upper"))
         assert f"{name.replace('_', ' ')}: {number(found[name])} ({low} to {high})" in text.lower()
     assert learner.iterations[-1]["hyperparameters"] == found
-    assert "What was inferred beside the weights" in text
+    assert "What was inferred besides the weights" in text
 
 
 def test_few_predictions_are_no_ground_for_a_warning(contents):

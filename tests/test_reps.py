@@ -212,7 +212,7 @@ def test_state_by_state_bad_input_is_refused():
     for arguments in ((q_values[1:], states, base), (q_values * np.nan, states, base), (q_values, states, 2 * base)):
         with pytest.raises(ValueError, match="expected"):
             reps_weights_by_state(*arguments, kl_bound=0.3)
-    with pytest.raises(ValueError, match=r"states: expected each of 0 … 6, got none of 2"):
+    with pytest.raises(ValueError, match=r"states: expected each of 0 … 6, got no 2"):
         reps_weights_by_state(q_values, states + (states >= 2), base, kl_bound=0.3)
     with pytest.raises(ValueError, match="kl_bound"):
         reps_weights_by_state(q_values, states, base, kl_bound=0.0)

@@ -351,7 +351,7 @@ def test_a_policy_that_returns_nan_is_named():
         ({"episodes": 0}, "episodes: expected a whole number >= 1, got 0"),
         ({"episodes": 2.5}, "episodes"),
         ({"max_steps": 0}, "max_steps: expected a whole number >= 1, got 0"),
-        ({"max_steps": None}, "Plain states no time limit"),
+        ({"max_steps": None}, "max_steps: expected a number, because Plain has no time limit, got None"),
         ({"key": 3}, "key: expected a JAX random key, got int"),
         ({"policy": object()}, "policy: expected an object with sample"),
     ],

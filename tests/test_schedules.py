@@ -147,7 +147,7 @@ def test_a_schedule_that_decides_nonsense_is_named(value):
     "statistics", [{"gain": np.ones(2)}, {"gain": {"mean": 1.0}}, {"reason": 1.0}, {"signal": 1.0}, {1: 1.0}]
 )
 def test_statistics_that_could_not_be_kept_are_named(statistics):
-    with pytest.raises(ValueError, match=r"schedule .*: expected statistics that are numbers by name, got"):
+    with pytest.raises(ValueError, match=r"schedule .*: expected named numbers as statistics, got"):
         decide(lambda situation: Bound(0.2, "mine", None, statistics), situation(proposed()))
 
 
@@ -159,7 +159,9 @@ def test_a_signal_that_is_no_share_is_named(signal):
 
 @pytest.mark.parametrize("bound", [Bound(0.3, "x", None, None), Bound(0.3, {1, 2}), Bound(0.3, None)])
 def test_a_reason_that_is_no_text_and_statistics_without_names_are_refused(bound):
-    with pytest.raises(ValueError, match=r"schedule <lambda>: expected a reason in words and statistics by name, got"):
+    with pytest.raises(
+        ValueError, match=r"schedule <lambda>: expected a text as reason and a mapping as statistics, got"
+    ):
         decide(lambda situation: bound, situation(proposed()))
 
 
@@ -199,7 +201,7 @@ def test_a_run_follows_a_schedule_of_the_users_own_records_why_and_goes_on_with_
     expert = ReturnExpert()
     while len(learner.iterations) < 2:
         learner.tell([expert(*query.trajectories) for query in learner.ask()])
-    with pytest.raises(ValueError, match=r"a run with schedule of the user's own: expected it again as schedule="):
+    with pytest.raises(ValueError, match=r"expected schedule= again, which the run was started with, got None"):
         resume(tmp_path / "run")
     whole = resume(tmp_path / "run", schedule=three_lines).run(expert)
     assert [summary["kl_bound"] for summary in whole.iterations] == [0.2, 0.4, 0.4]
@@ -229,5 +231,5 @@ def test_a_schedule_named_in_schedules_is_used_by_that_name(tmp_path, monkeypatc
 
 
 def test_a_schedule_of_the_users_own_has_to_be_given():
-    with pytest.raises(ValueError, match="schedule: expected a function of the user's own beside 'other'"):
+    with pytest.raises(ValueError, match="schedule: expected a function, because the settings say 'other', got none"):
         Learner("gridworld", schedule="other")

@@ -276,7 +276,7 @@ def test_a_second_person_practises_too_and_takes_no_answer_of_the_first_back(sit
         session.answer(session.wait(("instructions", QUESTION), WAIT)["turn"], given)
     view = session.wait(timeout=WAIT)
     assert (view["practice"], view["answered"], view["undo"]) == (None, 1, False)
-    with pytest.raises(ValueError, match="undo: expected an answer of the same person's to take back, got none"):
+    with pytest.raises(ValueError, match="undo: expected an answer by the same person to take back, got none"):
         session.answer(view["turn"], "undo")
     session.answer(view["turn"], "tie")
     assert session.wait(timeout=WAIT)["undo"]
@@ -616,12 +616,14 @@ def test_a_run_that_another_process_continues_shows_no_widget(directory):
             assert time.monotonic() < late
             time.sleep(0.02)
         before = (directory / "events.jsonl").read_bytes()
-        with pytest.raises(ValueError, match="this run is being continued elsewhere; stop that program first"):
+        with pytest.raises(
+            ValueError, match="expected a run that no other program continues, got one that does; stop it first"
+        ):
             learner.widget()
         other.communicate("end\n")
     assert (directory / "events.jsonl").read_bytes() == before
     bayespbrl.resume(directory).run(lambda first, second: "tie")  # another learner goes on
-    with pytest.raises(ValueError, match="another learner has written to it; resume the run"):
+    with pytest.raises(ValueError, match="got events that another learner has written; resume the run"):
         learner.widget()
     assert not held(directory)
 
@@ -629,7 +631,9 @@ def test_a_run_that_another_process_continues_shows_no_widget(directory):
 def test_a_widget_holds_the_run_until_it_is_closed(monkeypatch, capsys, directory):
     widget = bayespbrl.resume(directory).widget()
     try:
-        assert "continued elsewhere" in refused(monkeypatch, capsys, "ask", directory)
+        assert "expected a run that no other program continues, got one that does" in refused(
+            monkeypatch, capsys, "ask", directory
+        )
     finally:
         widget.close()
     assert not held(directory)
@@ -670,7 +674,9 @@ def directory(tmp_path):
 def test_a_run_that_is_continued_elsewhere_is_refused(monkeypatch, capsys, directory):
     with continuing(directory):
         for command in ("ask", "resume"):
-            assert "continued elsewhere" in refused(monkeypatch, capsys, command, directory)
+            assert "expected a run that no other program continues, got one that does" in refused(
+                monkeypatch, capsys, command, directory
+            )
     with continuing(directory):
         pass
 
@@ -678,7 +684,7 @@ def test_a_run_that_is_continued_elsewhere_is_refused(monkeypatch, capsys, direc
 def test_a_run_that_nobody_can_be_asked_about_is_refused(monkeypatch, capsys, directory, tmp_path):
     assert "settings.json" in refused(monkeypatch, capsys, "ask", tmp_path)
     bayespbrl.resume(directory).run(lambda first, second: "tie")
-    assert "this run is finished" in refused(monkeypatch, capsys, "ask", directory)
+    assert "expected a run with questions left, got a finished run" in refused(monkeypatch, capsys, "ask", directory)
     bayespbrl.start("gridworld", tmp_path / "simulated", **QUICK)
     assert "expected a run that a person answers" in refused(monkeypatch, capsys, "ask", tmp_path / "simulated")
 
@@ -690,8 +696,8 @@ def test_a_run_that_nobody_can_be_asked_about_is_refused(monkeypatch, capsys, di
         (["--answerer", " "], "answerer"),
         (["--port", "-1"], "port"),
         (["--port", "65536"], "port: expected a number from 0 to 65535, got 65536"),
-        (["--host", "192.0.2.1"], "port 0 on 192.0.2.1: cannot listen there"),  # another machine's
-        (["--host", ""], "port 0 on : cannot listen there"),
+        (["--host", "192.0.2.1"], "expected an address to listen on, got '192.0.2.1' and 0"),  # another machine's
+        (["--host", ""], "expected an address to listen on, got '' and 0"),
     ],
 )
 def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options, named):
@@ -703,7 +709,7 @@ def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options,
 @pytest.mark.parametrize("option", ["practice", "browser"])
 def test_a_simulated_expert_takes_no_practice_and_no_browser(monkeypatch, capsys, tmp_path, option):
     error = refused(monkeypatch, capsys, "run", "gridworld", f"--no-{option}", "--out", tmp_path / "new")
-    assert f"{option}: expected --no-{option} with the expert page alone" in error
+    assert f"{option}: expected --no-{option} only with the expert page, got the expert return" in error
     assert not (tmp_path / "new").exists()
 
 
@@ -717,5 +723,5 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys, di
     new = tmp_path / "new"
     assert "pip install" in refused(monkeypatch, capsys, "run", "gridworld", "--expert", "page", "--out", new)
     assert not new.exists()
-    with pytest.raises(ValueError, match="the widget needs the extra people"):
+    with pytest.raises(ValueError, match="widget: expected the extra people"):
         bayespbrl.resume(directory).widget()

@@ -73,7 +73,7 @@ def test_a_bad_value_is_refused_with_name_expected_and_got(name, value):
 @pytest.mark.parametrize("utility", ["linear-program", "known-reward"])
 @pytest.mark.parametrize("query", ["probably-better", "thompson", "information", "disagreement", "eubo"])
 def test_a_query_rule_that_needs_a_posterior_is_refused_without_one(utility, query):
-    message = f"^query: expected highest-utility with {utility}, no posterior, got '{query}'$"
+    message = f"^query: expected highest-utility with {utility}, which has no posterior, got '{query}'$"
     with pytest.raises(ValueError, match=message):
         settings_for("gridworld", utility=utility, query=query)
     assert settings_for("gridworld", utility=utility).questions.query == "highest-utility"

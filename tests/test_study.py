@@ -142,7 +142,7 @@ def test_a_bad_declaration_is_named(text, message):
 def test_an_unknown_study_task_or_value_is_one_line(monkeypatch, capsys, tmp_path):
     assert "study: expected one of" in refused(monkeypatch, capsys, "study", "nothing", "--out", tmp_path / "out")
     missing = tmp_path / "missing.toml"
-    assert "cannot be read" in refused(monkeypatch, capsys, "study", missing, "--out", tmp_path / "out")
+    assert "expected a readable file" in refused(monkeypatch, capsys, "study", missing, "--out", tmp_path / "out")
     for text, message in [("[tasks.mars]", "mars: environment"), ("[tasks.gridworld]\nexpert = 'me'", "expert")]:
         missing.write_text(text)
         assert message in refused(monkeypatch, capsys, "study", missing, "--out", tmp_path / "out")
@@ -243,7 +243,9 @@ def test_no_scheduler_is_one_line(monkeypatch, capsys, tmp_path):
     (tmp_path / "tiny.toml").write_text(DECLARATION)
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
         options = ("--scheduler", address, "--out", tmp_path / "out")
-        assert "scheduler: expected one at" in refused(monkeypatch, capsys, "study", tmp_path / "tiny.toml", *options)
+        assert f"scheduler: expected an answer from {address!r} within" in refused(
+            monkeypatch, capsys, "study", tmp_path / "tiny.toml", *options
+        )
     assert not (tmp_path / "out").exists()
 
 

@@ -116,7 +116,7 @@ def test_an_undo_takes_back_only_the_last_answer_and_no_question_that_another_lo
     ada.answer(ada.view["turn"], "first")
     settled(session)
     assert (ada.view["undo"], ben.view["undo"]) == (True, False)
-    with pytest.raises(ValueError, match="undo: expected an answer of the same person's"):
+    with pytest.raises(ValueError, match="undo: expected an answer by the same person"):
         ben.answer(ben.view["turn"], "undo")
     ben_at = ben.number
     ada.answer(ada.view["turn"], "undo")

@@ -259,14 +259,14 @@ def test_a_level_that_all_have_in_common_is_left_out_of_the_figures():
 @pytest.mark.parametrize("method", ["linear-program", "known-reward"])
 def test_an_estimate_without_a_posterior_is_refused(method):
     utility = fitted(method=method)
-    with pytest.raises(ValueError, match=r"estimate: expected one with a posterior, got .* without"):
+    with pytest.raises(ValueError, match=r"estimate: expected a utility estimate with a posterior, got \w+"):
         return_draws(utility, TRAJECTORIES)
-    with pytest.raises(ValueError, match="estimate: expected one with a posterior"):
+    with pytest.raises(ValueError, match="estimate: expected a utility estimate with a posterior"):
         q_draws(SimpleNamespace(estimate=utility), np.arange(2), np.arange(2))
 
 
 def test_a_learner_before_its_first_iteration_has_no_draws_of_q():
-    with pytest.raises(ValueError, match="estimate: expected one with a posterior, got NoneType without"):
+    with pytest.raises(ValueError, match="estimate: expected a utility estimate with a posterior, got NoneType"):
         q_draws(Learner("gridworld"), np.arange(2), np.arange(2))
 
 

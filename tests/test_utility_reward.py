@@ -66,16 +66,18 @@ def test_other_spaces_and_runs_without_an_estimate_are_refused(pendulum, tmp_pat
     with pytest.raises(ValueError, match=r"^observation_space: expected Box.*, the run's, got Box"):
         UtilityReward(gymnasium.make("CartPole-v1"), pendulum)
     bayespbrl.start("Pendulum-v1", tmp_path / "new", **FAST).ask()
-    with pytest.raises(ValueError, match="run: expected one with an estimate of the utility, got none yet"):
+    with pytest.raises(ValueError, match="run: expected a run with an estimate of the utility of states, got none yet"):
         UtilityReward(gymnasium.make("Pendulum-v1"), bayespbrl.load(tmp_path / "new"))
     known = run_of("Pendulum-v1", tmp_path / "known", utility="known-reward")
-    with pytest.raises(ValueError, match="run: expected one with an estimate of the utility, got KnownReward"):
+    with pytest.raises(
+        ValueError, match="run: expected a run with an estimate of the utility of states, got KnownReward"
+    ):
         UtilityReward(gymnasium.make("Pendulum-v1"), known)
     program = run_of("Pendulum-v1", tmp_path / "program", utility="linear-program")
     wrapped = UtilityReward(gymnasium.make("Pendulum-v1"), program)
     wrapped.reset(seed=1)
     assert wrapped.step(np.array([1.0], np.float32))[4]["utility_deviation"] == 0.0
-    with pytest.raises(ValueError, match="caution: expected 0 for an estimate without a posterior"):
+    with pytest.raises(ValueError, match="caution: expected 0 for an estimate without a posterior, got 1"):
         UtilityReward(gymnasium.make("Pendulum-v1"), program, caution=1.0)
 
 

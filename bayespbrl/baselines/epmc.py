@@ -73,8 +73,9 @@ def every_visit_preferences(
         if answer in (Answer.FIRST, Answer.SECOND):
             visited = [(policy.cells(each.states[:-1]), policy.numbers(each.actions)) for each in shown]
             preferred, other = visited if answer is Answer.FIRST else visited[::-1]
+            # Wirth & Fürnkranz (2013): towards the sample, by the learning rate
             better += LEARNING_RATE * (sampled(preferred, other, better) - better)
-            gains += action_values(better) / exploring
+            gains += action_values(better) / exploring  # EXP3 (Auer et al. 1995)
             pairs += 1
         yield Step(number, pairs, policy.with_table(best_actions(better)))
 
@@ -97,7 +98,7 @@ def sampled(preferred: Visits, other: Visits, before: Float[np.ndarray, "c a a"]
     wins = counts[0][:, :, None] * counts[1][:, None, :]  # pairs of visits with a of the preferred and a′ of the other
     losses = wins.transpose(0, 2, 1)
     said = (wins + losses > 0) & ~np.eye(actions, dtype=bool)
-    mean = 0.5 + (wins - losses) / np.maximum(wins + losses, 1) / (2 * shared)
+    mean = 0.5 + (wins - losses) / np.maximum(wins + losses, 1) / (2 * shared)  # Wirth & Fürnkranz (2013): (n+1)/2n
     return np.where(said, mean, before)
 
 
@@ -105,11 +106,11 @@ def action_values(better: Float[np.ndarray, "c a a"]) -> Float[np.ndarray, "c a"
     """The probability that an action is the best: 1 / (Σ_{a′≠a} 1/P(a ≻ a′) − (A − 2)) (Price et al. 1994)."""
     actions = better.shape[-1]
     inverse = np.where(np.eye(actions, dtype=bool), 0.0, 1 / np.maximum(better, 1e-12))
-    return 1 / (inverse.sum(axis=-1) - (actions - 2))
+    return 1 / (inverse.sum(axis=-1) - (actions - 2))  # Price et al. (1994)
 
 
 def exp3(gains: Float[np.ndarray, "c a"], exploration: float = EXPLORATION) -> Float[np.ndarray, "c a"]:
-    """The probabilities of EXP3: a share η uniform, the rest ∝ exp(η/A · gains)."""
+    """The probabilities of EXP3 (Auer et al. 1995): a share η uniform, the rest ∝ exp(η/A · gains)."""
     actions = gains.shape[1]
     powers = exploration / actions * (gains - gains.max(axis=1, keepdims=True))
     return exploration / actions + (1 - exploration) * np.exp(powers) / np.exp(powers).sum(axis=1, keepdims=True)

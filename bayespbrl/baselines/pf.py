@@ -81,18 +81,20 @@ def programming_by_feedback(
 
 
 def preferred_probability(margins: Float[np.ndarray, "..."], width: float = ERROR_WIDTH) -> Float[np.ndarray, "..."]:
-    """P(y ≻ x | w) = ½ + z/2M · (1 + log(M/|z|)) where |z| < M, else whether z > 0 (section 3.2).
+    """P(y ≻ x | w) = ½ + z/2M · (1 + log(M/|z|)) where |z| < M, else whether z > 0.
 
     Args:
       margins: z = wᵀ(ψ(y) − ψ(x)).
       width: M > 0.
+
+    Source: Akrour et al. (2014), section 3.2.
     """
     share = np.clip(np.asarray(margins) / width, -1.0, 1.0)
     return 0.5 + 0.5 * (share - xlogy(share, np.abs(share)))
 
 
 def log_likelihood(differences: Float[np.ndarray, "k s"]) -> Callable[[np.ndarray], Float[np.ndarray, " n"]]:
-    """Of N Gaussian points, whose directions are the utilities; rows are ψ(preferred) − ψ(other)."""
+    """Log likelihood of N Gaussian points, whose directions are the utilities; rows are ψ(preferred) − ψ(other)."""
 
     def of(points: Float[np.ndarray, "n s"]) -> Float[np.ndarray, " n"]:
         with np.errstate(divide="ignore"):
@@ -113,15 +115,17 @@ def moved(
     A point that the newest answer made impossible moves to any that is possible.
     """
     for _ in range(moves):
-        fresh = rng.standard_normal(points.shape)
-        height = np.maximum(log_p(points), -1e9) + np.log(rng.uniform(size=len(points)))
+        fresh = rng.standard_normal(points.shape)  # figure 2, step 1
+        height = np.maximum(log_p(points), -1e9) + np.log(rng.uniform(size=len(points)))  # figure 2, step 2
         angle = rng.uniform(0, 2 * np.pi, len(points))
-        low, high = angle - 2 * np.pi, angle
+        low, high = angle - 2 * np.pi, angle  # figure 2, step 3
         while True:
+            # figure 2, steps 4 and 5
             turned = points * np.cos(angle)[:, None] + fresh * np.sin(angle)[:, None]
             outside = ~(log_p(turned) > height) & (high - low > 1e-9)
             if not outside.any():
                 break
+            # figure 2, steps 8 and 9
             low, high = np.where(outside & (angle < 0), angle, low), np.where(outside & (angle >= 0), angle, high)
             angle = np.where(outside, rng.uniform(low, high), angle)
         points = turned
@@ -132,6 +136,8 @@ def planned(
     table: Float[np.ndarray, "s a s"], utilities: Float[np.ndarray, "n s"], discount: float = DISCOUNT
 ) -> Int[np.ndarray, "n s"]:
     """The optimal action of each state for each of N utilities of the next state, by policy iteration.
+
+    Source: Sutton & Barto (1998), section 4.3.
 
     Args:
       table: P(s′ | s, a).
@@ -169,6 +175,7 @@ def chosen(
     utilities = weights @ expected_visits(table, policies, start=start, steps=steps).T
     reached = (weights @ best)[:, None]
     wins = preferred_probability(utilities - reached)
+    # Viappiani & Boutilier (2010), with the error model of Akrour et al. (2014)
     return policies[np.argmax((utilities * wins + reached * (1 - wins)).mean(axis=0))]
 
 

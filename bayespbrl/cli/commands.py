@@ -41,30 +41,31 @@ app = typer.Typer(
 Answerer = Annotated[
     list[str] | None,
     typer.Option(
-        help="Name or pseudonym of the person who answers; it is kept with each answer and its time. Repeat the option "
-        "for several people who answer on a page at once: each gets an address, and a question of their own."
+        help="Name or pseudonym of the person who answers, kept with each answer and its time. Repeat the option "
+        "for several people who answer on pages at once: each gets an address and a question of their own."
     ),
 ]
 Practice = Annotated[
     bool,
-    typer.Option(help="Instructions and two practice questions for a person who has not answered in this run yet."),
+    typer.Option(help="Show instructions and two practice questions to a person who is new to this run."),
 ]
 Browser = Annotated[
     bool,
     typer.Option(
-        help="Open the page in the browser; only from a terminal with a display, not over SSH, and for one person."
+        help="Open the page in the browser: only for one person, at a terminal with a display, and not over SSH."
     ),
 ]
 ImportPackage = Annotated[
-    bool, typer.Option("--import-package", help="Import the package that the run's environment names (it runs code).")
+    bool,
+    typer.Option("--import-package", help="Import the package that the run's environment names; this runs its code."),
 ]
 Env = Annotated[str, typer.Argument(help=f"{', '.join(SHORT_NAMES)}, or any gymnasium id.")]
 
 
 # The options of a run and of each trial, with their help. One left out has the value of the environment's preset.
 RUN_OPTIONS = {
-    "answers": "Budget: the most answers that are asked for (default 20, ties included; iterations follow from it).",
-    "preset": "default: one for any task; or paper: the paper's protocol, with its constant KL bound.",
+    "answers": "Budget: maximum number of answers, ties included (default 20); the iterations follow from it.",
+    "preset": "default (for any task) or paper (the paper's protocol, with its constant KL bound).",
     "utility": "Estimate of the utility: posterior-mean, most-likely, posterior-draw, linear-program, or known-reward "
     "(a reference run trained on the hidden reward).",
     "query": "Rule that selects the trajectories to ask about: information-when-unsure (default), highest-utility (the "
@@ -76,10 +77,10 @@ RUN_OPTIONS = {
     "iterations": "Maximum number of cycles of the four steps; by default they follow from the answers.",
     "kl_bound": "KL bound of each policy update, in nats.",
     "updates_per_iteration": "Maximum number of policy updates per iteration; the paper's is 1.",
-    "clip_steps": "Steps of the part of each trajectory, drawn at random, that questions are about; all if omitted.",
-    "same_start": "Whether a question compares two trajectories from the same start, where resets by seed allow it.",
+    "clip_steps": "Steps of the random part of each trajectory that a question shows; all of it if omitted.",
+    "same_start": "Compare two trajectories from the same start, where resets of the environment by seed allow it.",
     "unasked_iterations": "Maximum number of consecutive iterations without a question (at most half the answers so "
-    "far); with the schedule confidence only while its confidence is high; the paper's is 0, and so is that of people.",
+    "far); with the schedule confidence, only while its confidence is high. 0 in the paper and for people.",
     "likelihood": "Likelihood of an answer: mixed (eq. 8), logistic or probit.",
     "prior_scale": "Prior standard deviation of each utility weight.",
     "steepness": "Steepness of the likelihood, for feature differences of root mean square length 1; inferred if "
@@ -87,17 +88,17 @@ RUN_OPTIONS = {
     "lapse_rate": "Share of answers modelled as coin tosses, in [0, 1); inferred if omitted, or 0 with "
     "--hyperparameters given.",
     "discount": "Discount of Q, in [0, 1); the paper's is 0.98.",
-    "trajectory_discount": "Discount of the trajectory features, in [0, 1]: 1, the default, where whole trajectories "
-    "are judged; the paper's is that of Q.",
+    "trajectory_discount": "Discount of the trajectory features, in [0, 1]: 1 by default, because experts judge whole "
+    "trajectories; the paper's is the discount of Q.",
     "wrong_answers": "Share of the simulated expert's answers that are reversed, in [0, 1].",
     "policy": "Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.",
     "centres": "Number of radial basis functions of each kind of feature.",
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
-    "repeats": "Share of the questions that are an earlier one with sides swapped, which shows how consistent a person "
-    "is; 0.1 for people, 0 for a simulated expert.",
+    "repeats": "Share of the questions that repeat an earlier one with sides swapped, to measure how consistent a "
+    "person is; 0.1 for people, 0 for a simulated expert.",
     "expert": "Who answers: return (simulated, always right), page (you, in a browser), terminal (you, at the prompt), "
-    "or a simulated expert who errs: stochastic, myopic, skipping, equal, mistaken (B-Pref's teachers) or margin (that "
-    "of Programming by Feedback).",
+    "or a simulated expert who errs: stochastic, myopic, skipping, equal, mistaken (B-Pref's teachers) or margin "
+    "(the error model of Programming by Feedback).",
 }
 
 
@@ -127,10 +128,11 @@ def run(
 ) -> None:
     """Learn a task from preferences; the run is kept in a directory."""
     _check_expert(options.get("expert"), answerer or [])
-    if not practice and options.get("expert") != "page":
-        raise ValueError("practice: expected --no-practice with the expert page alone")
-    if not browser and options.get("expert") != "page":
-        raise ValueError("browser: expected --no-browser with the expert page alone")
+    for name, wanted in (("practice", practice), ("browser", browser)):
+        if not wanted and (expert := options.get("expert")) != "page":
+            raise ValueError(
+                f"{name}: expected --no-{name} only with the expert page, got the expert {expert or 'return'}"
+            )
     directory = out or fresh_directory(env)
     learner = runs.start(env, directory, seed=seed, **options)
     with continuing(directory):
@@ -173,11 +175,9 @@ def ask(
     with continuing(directory):
         learner = runs.resume(directory, import_package=import_package)
         if learner.finished:
-            raise ValueError(f"{directory}: this run is finished; there is nothing left to ask")
+            raise ValueError(f"{directory}: expected a run with questions left, got a finished run")
         if (expert := learner.settings.expert) in SIMULATED:
-            raise ValueError(
-                f"expert: expected a run that a person answers, got {expert}, a simulated one: {directory}"
-            )
+            raise ValueError(f"{directory}: expected a run that a person answers, got the simulated expert {expert}")
         options: dict[str, Any] = {"answers": answers, "answerers": answerer or [], "practice": practice}
         ask_on_page(learner, directory, **options, place=Place(host, port, browser))
 
@@ -289,13 +289,18 @@ def _check_expert(name: str | None, answerers: Sequence[str]) -> None:
     for answerer in answerers:
         checks.short_name("answerer", answerer)
         if name not in ("terminal", "page"):
-            raise ValueError(f"answerer: expected a name with the expert page or terminal, got {answerer!r}")
+            raise ValueError(
+                f"answerer: expected a name only with the expert page or terminal, got {answerer!r} with "
+                f"{name or 'return'}"
+            )
     if len(set(answerers)) < len(answerers) or (name == "terminal" and len(answerers) > 1):
         raise ValueError(
-            f"answerer: expected one name for each person, and one person at the terminal, got {answerers}"
+            f"answerer: expected a different name for each person, and one person at the terminal, got {answerers}"
         )
     if name == "other":
-        raise ValueError("expert: expected return, page or terminal, got other; continue in Python with Learner.run")
+        raise ValueError(
+            "expert: expected a simulated expert, page or terminal, got other; continue in Python with Learner.run"
+        )
     if name == "page":
         check_page_installed()
 

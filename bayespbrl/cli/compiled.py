@@ -33,7 +33,7 @@ def keep_compiled() -> None:
 
 
 def _processor() -> str:
-    """A name for the kind of processor, with the instructions that it has where the system tells."""
+    """The kind of processor, with its instruction set where the system reports one."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

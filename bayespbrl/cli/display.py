@@ -35,7 +35,7 @@ def run_to_the_end(
 ) -> None:
     """Run a learner that keeps its events in `directory` to its end, with its progress, then `show_run`.
 
-    `answerers` are the names of the people who answer, at most one at the terminal; `practice` and `place` as of
+    `answerers` are the names of the people who answer, at most one at the terminal; `practice` and `place` as in
     `ask_on_page`.
     """
     if learner.settings.expert == "page":
@@ -105,7 +105,7 @@ def check_page_installed() -> None:
     try:
         from bayespbrl.people import page  # noqa: F401
     except ImportError as error:
-        raise ValueError(f"the page needs the extra people: pip install 'bayespbrl[people]' ({error})") from error
+        raise ValueError(f"page: expected the extra people (pip install 'bayespbrl[people]'), got {error}") from error
 
 
 def show_run(learner: Learner, directory: Path) -> None:

@@ -52,7 +52,9 @@ def compare_likelihoods(
         raise ValueError("candidates: expected at least one, got none")
     lacking = [name for name, model in candidates.items() if tied.any() and model.tie_threshold is None]
     if lacking:
-        raise ValueError(f"candidates: expected a tie_threshold in each because of the ties, got none in {lacking}")
+        raise ValueError(
+            f"candidates: expected a tie_threshold in each, because some answers are ties, got none in {lacking}"
+        )
     results = [
         _held_out_log_probability(differences, model, fold, tied, seed=seed, **sampling_options)
         for model in candidates.values()
@@ -124,4 +126,4 @@ def _error_of_sum(values: np.ndarray) -> np.ndarray:
     if number < 2:
         return np.full(values.shape[0], np.nan)
     with np.errstate(invalid="ignore"):
-        return np.sqrt(number * np.var(values, axis=-1, ddof=1))
+        return np.sqrt(number * np.var(values, axis=-1, ddof=1))  # Vehtari et al. (2017), eq. 24

@@ -13,14 +13,14 @@ from bayespbrl.utility import UtilityEstimate
 def expect_posterior(estimate: UtilityEstimate | None) -> tuple[UtilityEstimate, DataTree]:
     """`estimate` and its posterior; `ValueError` where it has none."""
     if estimate is None or estimate.posterior is None:
-        raise ValueError(f"estimate: expected one with a posterior, got {type(estimate).__name__} without")
+        raise ValueError(f"estimate: expected a utility estimate with a posterior, got {type(estimate).__name__}")
     return estimate, estimate.posterior
 
 
 def expect_estimate(estimate: UtilityEstimate | None) -> UtilityEstimate:
     """`estimate`; `ValueError` before there is one."""
     if estimate is None:
-        raise ValueError("estimate: expected a utility estimate, got none yet")
+        raise ValueError("estimate: expected a utility estimate, got None")
     return estimate
 
 

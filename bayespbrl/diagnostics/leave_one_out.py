@@ -14,7 +14,7 @@ from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_probabilities, refit, tied_rows
 from bayespbrl.models.posterior_tree import answers_of, bases_of, settings_of
 
-PARETO_K_LIMIT = 0.7
+PARETO_K_LIMIT = 0.7  # Vehtari et al. (2024)
 
 
 def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: int) -> xr.Dataset:
@@ -84,7 +84,7 @@ def _estimates(tree: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
         if np.ptp(column) == 0:  # a row of zeros: all weights are equal
             continue
         relative = min(1.0, float(array_stats.ess(column[..., None], chain_axis=0, draw_axis=1)[0]) / column.size)
-        log_weights, pareto_k[k] = array_stats.psislw(column.ravel(), r_eff=relative)
+        log_weights, pareto_k[k] = array_stats.psislw(column.ravel(), r_eff=relative)  # Vehtari et al. (2024)
         weights = np.exp(log_weights - np.max(log_weights))
         change[k] = _length(weights @ draws / weights.sum() - draws.mean(axis=0))
     return pareto_k, change

@@ -77,12 +77,14 @@ def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) ->
     """Draws (chain, draw, n), and the log prior (chain, draw) of the coordinates they depend on, up to a constant."""
     z = np.asarray(tree["posterior"]["coordinates"])
     scale = float(tree.attrs["prior_scale"])
-    log_prior = -np.sum(z**2, axis=2) / (2 * scale**2)
+    log_prior = -np.sum(z**2, axis=2) / (2 * scale**2)  # eq. 7
     if features is None:
         return np.asarray(tree["posterior"]["margins"]), log_prior
     known = np.asarray(tree["constant_data"]["differences"])
     if known.ndim != 2:
-        raise ValueError("features: expected none for a posterior over several settings of the features")
+        raise ValueError(
+            f"features: expected None for a posterior over {len(known)} settings, got shape {np.shape(features)}"
+        )
     features = checks.matrix("features", features, columns=known.shape[1])
     basis = low_rank(known).basis
     inside = features @ basis
@@ -91,7 +93,7 @@ def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) ->
     rounding = np.linalg.norm(rest, axis=1) <= 1e-9 * np.linalg.norm(features, axis=1)
     outside = low_rank(np.where(rounding[:, None], 0.0, rest))
     unseen = scale * np.random.default_rng(seed).standard_normal((*z.shape[:2], outside.loadings.shape[1]))
-    log_prior = log_prior - np.sum(unseen**2, axis=2) / (2 * scale**2)
+    log_prior = log_prior - np.sum(unseen**2, axis=2) / (2 * scale**2)  # eq. 7
     return z @ inside.T + unseen @ outside.loadings.T, log_prior
 
 

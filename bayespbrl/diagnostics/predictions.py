@@ -63,6 +63,7 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: An
         values = {name: value if value.ndim == 2 else value[:, None] for name, value in values.items()}
         threshold = values.pop("tie_threshold", np.zeros((1, 1)))
         likelihood = likelihood_of(model.likelihood, number_of_preferences(tree), **values)
+        # p(t − δ) and p(−t − δ) of Rao & Kupper (1967)
         for column, side in ((PREFERRED, 1.0), (DOMINATED, -1.0)):
             probabilities[:, column] += smoothed_probability(likelihood, side * margins - threshold, spread).sum(axis=0)
     probabilities /= len(draws["setting"])

@@ -2,7 +2,7 @@
 
 Each check counts something in the answers and in as many answers simulated by each posterior draw. The p-value is the
 probability that the simulated count is at least the observed one; half of the equal ones count. Near 0 or 1 the model
-does not explain what was counted (Gelman, Meng and Stern 1996).
+does not explain what was counted (Gelman, Meng & Stern 1996).
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
 
     Args:
       tree: what `sample_posterior` returned.
-      draws: at most so many draws of the posterior, evenly spaced.
+      draws: maximum number of draws of the posterior, evenly spaced.
       seed: of the simulated answers.
 
     Returns:
@@ -57,7 +57,7 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
 
 
 def _row(observed: np.ndarray, simulated: np.ndarray, possible: int) -> tuple[float, ...]:
-    p_value = np.mean(simulated > observed) + 0.5 * np.mean(simulated == observed)
+    p_value = np.mean(simulated > observed) + 0.5 * np.mean(simulated == observed)  # Gelman, Meng & Stern (1996)
     lower, upper = np.quantile(simulated, (0.05, 0.95))
     figures = (observed.mean(), simulated.mean(), lower, upper, possible, p_value if possible else np.nan)
     return tuple(float(figure) for figure in figures)
@@ -78,6 +78,7 @@ def _simulated(
         lapse_rate=lapse_rates,
     )
     threshold = drawn["tie_threshold"].values.reshape(-1, 1)[every] if "tie_threshold" in drawn else 0.0
+    # Rao & Kupper (1967): p(t − δ) and p(−t − δ)
     above, below = prob(likelihood, margins - threshold), prob(likelihood, -margins - threshold)
     uniform = rng.random(margins.shape)
     return np.where(uniform < above, 1, np.where(uniform >= 1 - below, -1, 0))

@@ -217,6 +217,7 @@ def _scores(predicted: np.ndarray, observed: np.ndarray, recalibrated: np.ndarra
         "brier_score": brier,
         "brier_score_expected": np.mean(variance),
         "brier_score_sd": np.sqrt(np.sum(variance * (1 - 2 * predicted) ** 2)) / number,
+        # the decomposition of Dimitriadis, Gneiting & Jordan (2021)
         "miscalibration": brier - after,
         "discrimination": uncertainty - after,
         "uncertainty": uncertainty,
@@ -224,7 +225,7 @@ def _scores(predicted: np.ndarray, observed: np.ndarray, recalibrated: np.ndarra
 
 
 def _calibration_error(predicted: np.ndarray, outcomes: np.ndarray) -> dict[str, float]:
-    """Expected calibration error: of the first row of the outcomes, and mean and deviation of those of all others."""
+    """Expected calibration error (Guo et al. 2017) of the first row of outcomes; mean and deviation of the others."""
     name = "expected_calibration_error"
     if len(predicted) == 0:
         return dict.fromkeys((name, f"{name}_expected", f"{name}_sd"), np.nan)

@@ -78,7 +78,7 @@ class AcrobotDynamics(FuncEnv):
         angle_1, angle_2, speed_1, speed_2 = state
         coupling = MASS_2 * LENGTH_1 * CENTRE  # m₂ l₁ l_c2
         sine, cosine = jnp.sin(angle_2), jnp.cos(angle_2)
-        # figure 11.5: d₁, d₂, φ₂, φ₁
+        # Sutton and Barto (1998), figure 11.5: d₁, d₂, φ₂, φ₁
         d1 = MASS_1 * CENTRE**2 + MASS_2 * (LENGTH_1**2 + CENTRE**2) + 2 * coupling * cosine + INERTIA_1 + INERTIA_2
         d2 = MASS_2 * CENTRE**2 + coupling * cosine + INERTIA_2
         phi2 = MASS_2 * CENTRE * GRAVITY * jnp.cos(angle_1 + angle_2 - jnp.pi / 2)
@@ -88,7 +88,7 @@ class AcrobotDynamics(FuncEnv):
             + (MASS_1 * CENTRE + MASS_2 * LENGTH_1) * GRAVITY * jnp.cos(angle_1 - jnp.pi / 2)
             + phi2
         )
-        # figure 11.5: θ̈₂, then θ̈₁ from it
+        # Sutton and Barto (1998), figure 11.5: θ̈₂, then θ̈₁ from it
         second = (torque + d2 / d1 * phi1 - coupling * speed_1**2 * sine - phi2) / (
             MASS_2 * CENTRE**2 + INERTIA_2 - d2**2 / d1
         )

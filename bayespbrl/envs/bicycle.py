@@ -91,7 +91,7 @@ class BicycleDynamics(FuncEnv):
     def accelerations(self, state: State, torque: ArrayLike, displacement: ArrayLike) -> tuple[Array, Array]:
         """(θ̈, ω̈) by Randløv and Alstrøm (1998)."""
         steering, steering_speed, lean, lean_speed = state
-        # 1/r_f, 1/r_b and 1/r_CM instead of the radii, which are infinite when riding straight on
+        # Randløv and Alstrøm (1998), with 1/r_f, 1/r_b and 1/r_CM: riding straight on the radii are infinite
         tangent = jnp.abs(jnp.tan(steering))
         front, back = jnp.abs(jnp.sin(steering)) / WHEELBASE, tangent / WHEELBASE
         centre = tangent / jnp.sqrt(((WHEELBASE - CENTRE_BEHIND) * tangent) ** 2 + WHEELBASE**2)

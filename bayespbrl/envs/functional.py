@@ -72,7 +72,8 @@ class FunctionalEnv(gymnasium.Env):
             raise ValueError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}")
         if render_mode is not None and not hasattr(dynamics, "draw"):
             raise ValueError(
-                f"render_mode: {type(dynamics).__name__} has no method draw(observation, axes), got rgb_array"
+                f"render_mode: expected None, because {type(dynamics).__name__} has no method draw(observation, axes), "
+                f"got {render_mode!r}"
             )
         self.dynamics = dynamics
         self.observation_space = dynamics.observation_space

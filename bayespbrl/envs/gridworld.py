@@ -20,7 +20,7 @@ STAY_PROBABILITY = 0.5
 # stay, left, down, right, up as (row, column); rows count downwards from the top
 MOVES = np.array([(0, 0), (0, -1), (1, 0), (0, 1), (-1, 0)])
 START = SIZE * (SIZE // 2) + SIZE // 2  # the centre
-# r = 2^−(4−(j−1)+(i−1)) for row i and column j counted from 1: top right 1, bottom left 1/256.
+# Akrour et al. (2014): r = 2^−(4−(j−1)+(i−1)) for row i and column j counted from 1: top right 1, bottom left 1/256.
 REWARDS = 2.0 ** -(SIZE - 1 - np.arange(SIZE)[None, :] + np.arange(SIZE)[:, None]).astype(float)
 Cell = Int[Array, ""]
 

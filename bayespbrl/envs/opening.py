@@ -121,7 +121,9 @@ def _make(spec: EnvSpec) -> gymnasium.Env:
     try:
         return gymnasium.make(spec)
     except Exception as error:
-        raise ValueError(f"environment {spec.id} cannot be made: {_one_line(error)}") from error
+        raise ValueError(
+            f"environment {spec.id}: expected one that gymnasium.make can make, got {_one_line(error)}"
+        ) from error
 
 
 def _one_line(error: Exception) -> str:
@@ -162,7 +164,7 @@ def _plain_space(space: Any) -> Any:
 
 
 def check_of_space(name: str, values: np.ndarray, space: gymnasium.Space[Any]) -> None:
-    """That rows are of a flattened space: shape (N, n), or whole numbers below its size; `ValueError` else."""
+    """Check that rows are of a flattened space: shape (N, n), or whole numbers below its size."""
     if isinstance(space, Discrete):
         fits = values.ndim == 1 and values.dtype.kind in "iu" and bool(np.all((values >= 0) & (values < space.n)))
     else:

@@ -46,7 +46,7 @@ def answered(
     """The event of an answer to question number `query`.
 
     Args:
-      answerer, seconds: as of `Learner.tell`.
+      answerer, seconds: as in `Learner.tell`.
       session: of the sitting, the same in all its answers.
       replays: how often the clips began again while the question was shown.
 
@@ -64,7 +64,7 @@ def undone(answerer: str | None = None) -> Entry:
 
 
 def checked_about(event: Mapping[str, Any]) -> dict[str, Any]:
-    """What an event says about who answered and how, of what is known; `ValueError` as of `answered`."""
+    """What an event says about who answered and how, of what is known; `ValueError` as in `answered`."""
     known: dict[str, Any] = {}
     for name in ("answerer", "session"):
         if event.get(name) is not None:

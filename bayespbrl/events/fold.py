@@ -53,7 +53,7 @@ def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
             state = apply(state, entry)
         except (KeyError, TypeError, IndexError, AttributeError) as error:
             reason = f"{type(error).__name__} {error}"
-            raise ValueError(f"event: expected a complete one, got {dict(entry.event)} ({reason})") from error
+            raise ValueError(f"event: expected a complete event, got {dict(entry.event)} ({reason})") from error
     return state
 
 
@@ -105,7 +105,9 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
         preferences, candidates = preferences.start(candidates[0]), candidates[1:]
     if event.get("restarted", False):
         if state.restart is not None or not state.kept:
-            raise ValueError(f"collected: expected a policy to be started anew once, got {event['iteration']}")
+            raise ValueError(
+                f"collected: expected at most one restart, of a run that keeps a policy, got {event['iteration']}"
+            )
         kept = Restart(state.iteration, state.kept, state.kept_policy, state.kept_tried)
         state = replace(
             state,

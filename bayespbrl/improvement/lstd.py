@@ -1,4 +1,4 @@
-"""Least-squares temporal differences with ℓ2–ℓ2 regularisation (paper, step 2: estimating the Q-function)."""
+"""Least-squares temporal differences (Boyan 1999), ℓ2–ℓ2 regularised (paper, step 2: estimating the Q-function)."""
 
 from dataclasses import dataclass
 
@@ -80,10 +80,11 @@ def solve_lstd(sums: TransitionSums, *, discount: float, fixed_point_ridge: floa
     size = len(gram)
     # Hoffman et al. (2012), ℓ2–ℓ2, with Σ = PΦᵀ: P[ΦᵀΦ′, Φᵀu]
     projected = _solve_symmetric(gram, projection_ridge, np.column_stack([cross, target]))
-    mixing = np.eye(size) - discount * projected[:, :size]  # M: X = Φ − γΦΣΦ′ = ΦM
+    mixing = np.eye(size) - discount * projected[:, :size]  # M: X = Φ − γΦΣΦ′ = ΦM (Hoffman et al. 2012)
     normal = mixing.T @ gram @ mixing  # XᵀX
     projected_target = projected[:, size] if target.ndim == 1 else projected[:, size:]
-    return _solve_symmetric(normal, fixed_point_ridge, mixing.T @ (gram @ projected_target))  # θ = (XᵀX + β₁I)⁻¹XᵀΦΣu
+    # Hoffman et al. (2012), ℓ2–ℓ2: θ = (XᵀX + β₁I)⁻¹XᵀΦΣu
+    return _solve_symmetric(normal, fixed_point_ridge, mixing.T @ (gram @ projected_target))
 
 
 def _solve_symmetric(matrix: Float[np.ndarray, "q q"], ridge: float, right: Targets) -> Targets:

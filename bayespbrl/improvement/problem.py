@@ -15,8 +15,8 @@ from bayespbrl.improvement.q_function import Critic
 from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.estimate import UtilityEstimate
 
-# How many transitions of the last iterations LSTD takes, where there are as many: some ten for each of its features,
-# and no more than a person would wait for.
+# Bounds on the transitions of the last iterations that LSTD takes: about ten for each of its features, and no more than
+# a person would wait for.
 LEAST_TRANSITIONS, MOST_TRANSITIONS = 5_000, 10_000
 
 
@@ -31,18 +31,18 @@ class PolicyUpdate:
       updates_per_iteration: most updates of the policy from the same trajectories and utility, until it has moved by
         most of the bound. Each has the Q of the policy before it; all but the first hold a continuous policy's spread.
         The paper's is 1.
-      recent_iterations: the update takes the states of so many last iterations; None for those of all.
-      critic_iterations: LSTD takes the transitions of so many last iterations, but at least `LEAST_TRANSITIONS` and at
-        most `MOST_TRANSITIONS`; None for those of all, as in the paper. Old ones say little of the current policy.
+      recent_iterations: number of last iterations whose states the update takes; None for all.
+      critic_iterations: number of last iterations whose transitions LSTD takes, but at least `LEAST_TRANSITIONS` and at
+        most `MOST_TRANSITIONS`; None for all, as in the paper. Old ones say little about the current policy.
       checked: whether each update is checked by trajectories of the policy without its noise: the run keeps the policy
         that the posterior thinks best, without noise, and goes on from there after a step back. The paper's learner
         never looks back.
       check_episodes: number of these trajectories, of each policy.
-      restart_iterations: the run ends with so many iterations of a policy that is started anew, because the first may
-        be stuck where its own trajectories show nothing better; 0: none. Only where updates are checked and the number
-        of iterations follows from the answers.
-      update_states: most of these states that the update takes, drawn at random, where they are continuous: it bounds
-        time and memory for long episodes.
+      restart_iterations: number of iterations at the end of the run after the policy is restarted, because the first
+        may be stuck where its own trajectories show nothing better; 0: no restart. Only where updates are checked and
+        the number of iterations follows from the answers.
+      update_states: maximum number of these states, drawn at random, where they are continuous: it bounds time and
+        memory for long episodes.
     """
 
     kl_bound: float = 0.3
@@ -125,7 +125,7 @@ def step_utilities(
 
 
 def recent(trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iteration: int) -> Sequence[Trajectory]:
-    """The trajectories whose transitions LSTD takes; arguments as of `states_of_update`."""
+    """The trajectories whose transitions LSTD takes; arguments as in `states_of_update`."""
     if options.critic_iterations is None:
         return trajectories
     lengths = np.cumsum([len(trajectory) for trajectory in reversed(trajectories)])
@@ -135,7 +135,7 @@ def recent(trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iter
 
 
 def quarters(trajectories: Sequence[Trajectory]) -> Int[np.ndarray, " n"]:
-    """For each transition a quarter of the trajectories: every fourth is in the same."""
+    """The quarter of the trajectories, 0 to 3, that each transition is in; every fourth trajectory shares one."""
     return np.repeat(np.arange(len(trajectories)) % 4, [len(trajectory) for trajectory in trajectories])
 
 

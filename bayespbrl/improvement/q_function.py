@@ -1,4 +1,4 @@
-"""Step 2, its critic: from the utilities of transitions to Q, by LSTD (paper, "Step 2")."""
+"""Step 2, the critic: from the utilities of transitions to Q, by LSTD (paper, "Step 2")."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -68,7 +68,7 @@ class QFunction:
         """Q of N pairs, and that of the halves."""
         table = _with_bias(self.features(states, actions))
         halves = None if self.halves is None else np.tensordot(table, self.halves, axes=1)
-        return table @ self.weights, halves
+        return table @ self.weights, halves  # Q = φᵀθ (paper, step 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def estimate_q(
     features: StateActionFeatures,
     critic: Critic,
 ) -> QFunction:
-    """LSTD-Q with a bias column, from every given transition.
+    """LSTD-Q (Lagoudakis & Parr 2003) with a bias column (paper, step 2), from every given transition.
 
     Args:
       policy: whose Q.
@@ -182,4 +182,4 @@ def _expected_features(
 
 
 def _with_bias(features: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d+1"]:
-    return np.column_stack([features, np.ones(len(features))])
+    return np.column_stack([features, np.ones(len(features))])  # bias term (paper, step 2)

@@ -17,7 +17,7 @@ TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for l
 RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
 CONSTANT = "constant Q: nothing to gain"
-PerSample = Float[np.ndarray, " n"]  # one number a sample
+PerSample = Float[np.ndarray, " n"]  # one number per sample
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class RepsSolution:
 
     @property
     def effective_samples(self) -> float:
-        """Kish's 1/Σ pᵢ²."""
+        """The effective sample size 1/Σ pᵢ² (Kish 1965)."""
         return float(1 / np.sum(self.probabilities**2))
 
 
@@ -81,7 +81,7 @@ def whitened(state_features: Float[np.ndarray, "n d"], base_weights: PerSample) 
       ValueError: entries that are not finite.
     """
     checks.finite("state_features", state_features)
-    centred = state_features - base_weights @ state_features
+    centred = state_features - base_weights @ state_features  # φ − φ̂ of eq. 11
     covariance = centred.T @ (centred * base_weights[:, None])
     values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
     keep = values > max(values[-1], 0.0) * RANK_TOLERANCE**2
@@ -133,17 +133,17 @@ def reps_weights(
             temperature, dual, standardised = reached, multipliers, scaled
     logits = np.log(base) + (standardised - features @ dual) / temperature  # eq. 12
     probabilities = np.exp(logits - np.max(logits))
-    probabilities /= np.sum(probabilities)
+    probabilities /= np.sum(probabilities)  # eq. 12
     positive = probabilities > 0
     return RepsSolution(
-        sample_weights=probabilities / base,  # mean Σ W·p/W = 1 by construction
+        sample_weights=probabilities / base,  # eq. 14; mean Σ W·p/W = 1 by construction
         probabilities=probabilities,
-        value_weights=scale * (constraint.mapping @ dual),
+        value_weights=scale * (constraint.mapping @ dual),  # eq. 12: V(s) = vᵀφ(s)
         temperature=scale * temperature,
-        kl=float(probabilities[positive] @ np.log((probabilities / base)[positive])),
+        kl=float(probabilities[positive] @ np.log((probabilities / base)[positive])),  # eq. 11
         kl_bound=kl_bound,
-        feature_gap=float(np.max(np.abs(probabilities @ features), initial=0.0)),
-        feature_gap_raw=float(np.max(np.abs((probabilities - base) @ phi), initial=0.0)),
+        feature_gap=float(np.max(np.abs(probabilities @ features), initial=0.0)),  # eq. 11
+        feature_gap_raw=float(np.max(np.abs((probabilities - base) @ phi), initial=0.0)),  # eq. 11
         rank_kept=features.shape[1],
         converged=converged,
         status=status,
@@ -172,7 +172,7 @@ def reps_weights_by_state(
     q, states, base = _checked_samples(q_values, states, base_weights, kl_bound)
     visits = np.bincount(states, weights=base)
     if np.any(visits == 0):
-        raise ValueError(f"states: expected each of 0 … {len(visits) - 1}, got none of {np.argmin(visits)}")
+        raise ValueError(f"states: expected each of 0 … {len(visits) - 1}, got no {np.argmin(visits)}")
     means = np.bincount(states, weights=base * q) / visits
     spread = np.sqrt(base @ (q - means[states]) ** 2)
     constant = not spread > 1e-8 * np.max(np.abs(q))
@@ -181,10 +181,10 @@ def reps_weights_by_state(
     by_state = partial(_exponential, logarithms=logarithms, q_values=scaled, states=states, visits=visits)
     temperature = 1.0 if constant else _temperature(lambda eta: by_state(eta)[2], kl_bound)
     chances, values, kl = by_state(temperature)
-    probabilities = visits[states] * chances
-    gap = float(np.max(np.abs(np.bincount(states, weights=probabilities) - visits)))
+    probabilities = visits[states] * chances  # eq. 12
+    gap = float(np.max(np.abs(np.bincount(states, weights=probabilities) - visits)))  # eq. 11
     return RepsSolution(
-        sample_weights=probabilities / base,
+        sample_weights=probabilities / base,  # eq. 14
         probabilities=probabilities,
         value_weights=means if constant else means + spread * values,
         temperature=1.0 if constant else float(spread * temperature),
@@ -212,6 +212,7 @@ def _exponential(
     normaliser = highest + np.log(np.bincount(states, weights=np.exp(logits - highest[states])))
     logits = logits - normaliser[states]
     chances = np.exp(logits)
+    # V(s) that normalises eq. 12 in every state, and KL of eq. 11
     return chances, temperature * normaliser, float((visits[states] * chances) @ (logits - logarithms))
 
 
@@ -222,6 +223,7 @@ def _temperature(kl: Callable[[float], float], kl_bound: float) -> float:
         return low
     while kl(high) > kl_bound:  # at most a few dozen times: KL falls as 1/η²
         high *= 10
+    # eq. 11, with equality
     logarithm = brentq(lambda value: kl(float(np.exp(value))) - kl_bound, np.log(low), np.log(high), xtol=1e-12)
     return float(np.exp(logarithm))
 
@@ -229,7 +231,7 @@ def _temperature(kl: Callable[[float], float], kl_bound: float) -> float:
 def advantages(
     q_values: PerSample, constraint: WhitenedFeatures | Int[np.ndarray, " n"], base_weights: PerSample
 ) -> PerSample:
-    """Aᵢ = Qᵢ − V(sᵢ) with V the regression of Q on the constraint's features under W.
+    """Aᵢ = Qᵢ − V(sᵢ) of eq. 12, with V the regression of Q on the constraint's features under W.
 
     The limit of REPS at small bounds: p − W → √(2ε/E[A²])·W·A. Zero where only rounding is left of it.
 
@@ -262,7 +264,8 @@ def _checked_samples(
     for name, array in (("q_values", q_values), ("state_features", states), ("base_weights", base_weights)):
         checks.finite(name, array)
     if np.any(base_weights <= 0) or abs(np.sum(base_weights) - 1) > 1e-6:
-        raise ValueError(f"base_weights: expected positive entries with sum 1, got sum {np.sum(base_weights)}")
+        least, total = np.min(base_weights), np.sum(base_weights)
+        raise ValueError(f"base_weights: expected positive entries with sum 1, got least {least:g} and sum {total:g}")
     return q_values, states, base_weights
 
 
@@ -275,7 +278,7 @@ def _solve_dual(
     eta = unknown[0]
     advantage: Any = ca.DM(q_values)
     if rank:
-        advantage = advantage - ca.mtimes(ca.DM(features), unknown[1:])
+        advantage = advantage - ca.mtimes(ca.DM(features), unknown[1:])  # eq. 13: Q − vᵀφ
     logits = ca.DM(np.log(base_weights)) + advantage / eta
     dual = eta * kl_bound + eta * ca.logsumexp(logits)  # eq. 13
     options: dict[str, Any] = {

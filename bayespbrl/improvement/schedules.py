@@ -1,6 +1,6 @@
-"""The KL bound of each update: constant, or by the posterior's confidence in the update (paper, future work).
+"""The KL bound of each update: constant, or by the posterior's confidence in the update (paper, conclusion).
 
-A schedule decides once an iteration, after the utility and Q are estimated and before the policy moves. It is called
+A schedule decides once per iteration, after the utility and Q are estimated and before the policy moves. It is called
 with the `Situation` and returns the bound in nats, or a `Bound` with its reason. Three lines make one of your own:
 
     def cautious(situation):
@@ -141,10 +141,10 @@ def decide(schedule: Schedule, situation: Situation) -> Bound:
     value = checks.positive(f"{name}, KL bound", bound.kl_bound)
     if not isinstance(bound.reason, str) or not isinstance(bound.statistics, Mapping):
         got = f"{bound.reason!r} and {bound.statistics!r}"
-        raise ValueError(f"{name}: expected a reason in words and statistics by name, got {got}")
+        raise ValueError(f"{name}: expected a text as reason and a mapping as statistics, got {got}")
     for key, figure in bound.statistics.items():
         if not isinstance(key, str) or key in ("reason", "signal") or not _can_be_kept(figure):
-            raise ValueError(f"{name}: expected statistics that are numbers by name, got {key!r}: {figure!r}")
+            raise ValueError(f"{name}: expected named numbers as statistics, got {key!r}: {figure!r}")
     signal = None if bound.signal is None else checks.share(f"{name}, signal", bound.signal)
     return Bound(value, bound.reason, signal, dict(bound.statistics))
 

@@ -84,10 +84,11 @@ class ProposedUpdate:
         of the mean Q. That takes no solution of REPS.
         """
         if self.q_draws is None:
-            raise ValueError("gains: expected a utility estimate with a posterior, got one without")
+            raise ValueError(f"gains: expected Q under posterior draws, got q_draws={self.q_draws}")
         if kl_bound is None:
-            promised = advantages(self.q_values, self.constraint, self.base_weights)
+            promised = advantages(self.q_values, self.constraint, self.base_weights)  # eq. 12 at small bounds
             return np.asarray((self.base_weights * promised) @ self.q_draws)
+        # the objective of eq. 11, less its value without an update
         return np.asarray((self.solve(kl_bound).probabilities - self.base_weights) @ self.q_draws)
 
     @cached_property
@@ -105,7 +106,7 @@ class ProposedUpdate:
             product = (self.base_weights @ first**2) * (self.base_weights @ second**2)
             correlations.append(self.base_weights @ (first * second) / np.sqrt(product) if product > 0 else 0.0)
         correlation = max(float(np.mean(correlations)), 0.0)
-        return 2 * correlation / (1 + correlation)
+        return 2 * correlation / (1 + correlation)  # Spearman (1910), Brown (1910)
 
     def agreement(self, kl_bound: float | None = None) -> float:
         """Share of the draws that expect a gain."""
@@ -123,7 +124,7 @@ class Improvement:
       updates: how many there were.
       kl_fitted_policy: mean KL of the new policy from the old one over the states of the updates, nats.
       entropy: mean entropy of the new policy over the same states, nats.
-      action_standard_deviation: mean of the new policy's over the same states, one number an action dimension, in the
+      action_standard_deviation: mean of the new policy's over the same states, one number per action dimension, in the
         action's units; None for discrete actions.
     """
 
@@ -253,7 +254,7 @@ def _all_actions(
     policy: DiscretePolicy, states: Shaped[np.ndarray, "v ..."], visits: Float[np.ndarray, " v"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Every action of every visited state, weighted by q(a|s) × visits; actions that q excludes are left out."""
-    weights = policy.probabilities(states) * visits[:, None]
+    weights = policy.probabilities(states) * visits[:, None]  # q(a|s) × visits (paper, step 2)
     rows, actions = np.nonzero(weights)
     base_weights = weights[rows, actions]
     return rows, actions, base_weights / np.sum(base_weights)

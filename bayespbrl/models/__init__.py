@@ -1,7 +1,7 @@
 """Densities and how to sample them.
 
 preference_model         σ, m, λ, likelihood and ties in one object; eqs. 7-8 in NumPyro
-priors                   of what is inferred beside the weights
+priors                   of what is inferred besides the weights
 likelihoods              the probability of an answer given a margin: eq. 8, lapses, Bradley-Terry, probit, ties
 elliptical_slice         the kernel's textbook algorithm; elliptical_slice_kernel is the kernel for NumPyro
 low_rank                 the part of the utility that the answers determine

@@ -9,7 +9,7 @@ from threadpoolctl import ThreadpoolController
 
 
 class _Limit:
-    """One thread of BLAS, which is a setting of the process, as long as anybody wants it."""
+    """Limits BLAS to one thread, a setting of the whole process, while any caller asks for it."""
 
     def __init__(self) -> None:
         self.controller, self.lock = ThreadpoolController(), Lock()

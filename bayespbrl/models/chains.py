@@ -1,4 +1,4 @@
-"""Chains over all unknowns: Gibbs moves and elliptical slices, by one compiled sampler a capacity."""
+"""Chains over all unknowns: Gibbs moves and elliptical slices, by one compiled sampler per capacity."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -45,10 +45,10 @@ from bayespbrl.models.step_moves import Steps, step_moves, steps_of
 # badly.
 REFERENCE_POWER = 0.5
 # Moves around the reference's and the prior's ellipses per recorded draw; those around the prior's help in the tails.
-# They are made in so many sweeps, where more than the weights is unknown: lapse rate and weights move in turn.
+# They are split into SWEEPS sweeps where more than the weights is unknown: lapse rate and weights move in turn.
 REFERENCE_MOVES, PRIOR_MOVES, SWEEPS = 26, 6, 6
-# Above `FEW` answers the moves are others, and the references are fitted again after the burn-in. With steps and ties:
-# the same per sweep for at most so many dimensions, where so many independent draws are tried too; in more dimensions
+# Above `FEW` answers other moves are made, and the references are fitted again after the burn-in. With steps and ties:
+# STEP_MOVES round the reference per sweep, and INDEPENDENT draws tried in at most LOW_DIMENSION dimensions; in more,
 # every coordinate of the reference has a move of its own. With steps alone the weights move by flights.
 LOW_DIMENSION, STEP_MOVES, INDEPENDENT = 32, 24, 256
 # Without steps the reference is nearly the posterior, and most is done by its dynamics.

@@ -100,15 +100,15 @@ def _at_once(draws: Float[np.ndarray, "chain draw q"]) -> tuple[Float[np.ndarray
 def _rank_normalised(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarray, "m n q"]:
     """Normal scores of the ranks (Vehtari et al. 2021, eq. 14)."""
     ranks = rankdata(split.reshape(-1, split.shape[2]), axis=0)
-    return np.asarray(ndtri((ranks - 3 / 8) / (len(ranks) + 1 / 4))).reshape(split.shape)
+    return np.asarray(ndtri((ranks - 3 / 8) / (len(ranks) + 1 / 4))).reshape(split.shape)  # Vehtari et al., eq. 14
 
 
 def _split_rhat(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarray, " q"]:
     """R̂ (Vehtari et al. 2021, eqs. 1-4)."""
     number = split.shape[1]
-    # eqs. 1-2: B/N and W
+    # Vehtari et al. (2021), eqs. 1-2: B/N and W
     between, within = np.var(split.mean(axis=1), axis=0, ddof=1), np.mean(np.var(split, axis=1, ddof=1), axis=0)
-    return np.asarray(np.sqrt(between / within + (number - 1) / number))  # eqs. 3-4
+    return np.asarray(np.sqrt(between / within + (number - 1) / number))  # Vehtari et al., eqs. 3-4
 
 
 def _effective_sample_size(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarray, " q"]:
@@ -117,7 +117,8 @@ def _effective_sample_size(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarra
     centred = split - split.mean(axis=1, keepdims=True)
     power = np.abs(rfft(centred, next_fast_len(2 * number), axis=1)) ** 2
     covariance = irfft(power, next_fast_len(2 * number), axis=1)[:, :number].mean(axis=0) / number
-    variance = covariance[0] + np.var(split.mean(axis=1), axis=0, ddof=1)  # eq. 3
+    variance = covariance[0] + np.var(split.mean(axis=1), axis=0, ddof=1)  # Vehtari et al., eq. 3
+    # Vehtari et al., eq. 10: autocorrelations of all chains together
     rho = 1 - (covariance[0] * number / (number - 1) - covariance) / variance
     rho[0] = 1.0
     last = max(0, (number - 3) // 2)  # the last pair of lags that is looked at
@@ -129,4 +130,4 @@ def _effective_sample_size(split: Float[np.ndarray, "m n q"]) -> Float[np.ndarra
     beyond = rho[2 * first, np.arange(quantities)]
     beyond = np.where(negative.any(axis=0), np.maximum(beyond, 0.0), beyond)
     total = chains * number
-    return np.asarray(total / np.maximum(-1 + 2 * kept + beyond, 1 / np.log10(total)))
+    return np.asarray(total / np.maximum(-1 + 2 * kept + beyond, 1 / np.log10(total)))  # Vehtari et al., eqs. 11-13

@@ -18,7 +18,7 @@ BATCHES_AHEAD = 2
 
 
 def turned(v: Float[Array, "*v"], fresh: Float[Array, "*v"], angles: Float[Array, " j"]) -> Float[Array, " j *v"]:
-    """J points of the ellipse: v cos α + v′ sin α (figure 2, step 4)."""
+    """J points of the ellipse: v cos α + v′ sin α (Murray, Adams & MacKay 2010, figure 2, step 4)."""
     axes = (slice(None),) + (None,) * v.ndim
     return v * jnp.cos(angles)[axes] + fresh * jnp.sin(angles)[axes]
 
@@ -69,8 +69,8 @@ def shrink(
     # a loop rather than unrolled: the compiler would fuse the steps into each other, again and again
     def step(bracket: _Bracket, uniform: Float[Array, "*m"]) -> tuple[_Bracket, Float[Array, "*m"]]:
         angle, low, high = bracket
-        low, high = jnp.where(angle < 0, angle, low), jnp.where(angle < 0, high, angle)
-        angle = low + (high - low) * uniform
+        low, high = jnp.where(angle < 0, angle, low), jnp.where(angle < 0, high, angle)  # figure 2, step 8
+        angle = low + (high - low) * uniform  # figure 2, step 9
         return (angle, low, high), angle
 
     (_, low, high), angles = lax.scan(step, (angle, low, high), jnp.moveaxis(uniforms, -1, 0))
@@ -124,10 +124,12 @@ def elliptical_moves(
 def independent_move(
     key: PRNGKeyArray, x: Float[Array, " n"], ellipse: Ellipse, *, candidates: int
 ) -> Float[Array, " n"]:
-    """The first of so many independent draws of the ellipse's Gaussian that lies on the slice; `x` where none does.
+    """The first of `candidates` independent draws of the ellipse's Gaussian on the slice; `x` where none is.
 
     Given the slice's height, the target's conditional distribution is that Gaussian restricted to the slice, and
     whether a draw falls into it does not depend on `x`: the move is exact. It goes anywhere at once, in few dimensions.
+
+    Source: slice sampling, Neal (2003).
     """
     key_height, key_noise = random.split(key)
     v = ellipse.lift(x)
@@ -178,6 +180,7 @@ class _Drawn(NamedTuple):
 
 
 def _drawn(key: PRNGKeyArray, ellipse: Ellipse, dtype: jnp.dtype, *, moves: int, batches: int, batch: int) -> _Drawn:
+    # Murray, Adams & MacKay (2010), figure 2; the candidates ahead are steps 4 and 9
     key_noise, key_uniform, key_more = random.split(key, 3)
     noise = ellipse.noise(key_noise, moves)  # figure 2, step 1
     uniforms = random.uniform(key_uniform, (moves, batches * batch + 1), dtype=dtype)

@@ -109,7 +109,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         return ("z", "diverging")
 
     def get_diagnostics_str(self, state: EllipticalSliceState) -> str:
-        """For the progress bar."""
+        """The text beside NumPyro's progress bar."""
         return f"{float(state.candidates):.1f} candidates a move"
 
     def init(
@@ -235,10 +235,10 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         return self._log_probs(z, model_args, model_kwargs)[1]
 
     def _check(self, sites: Sites, model_args: Args, model_kwargs: Keywords) -> None:
-        """Every latent site is Gaussian, unscaled, unmasked and independent of the others; no plate is subsampled."""
+        """Check that latent sites are Gaussian, unscaled, unmasked and independent, and that no plate is subsampled."""
         latent = [name for name, site in sites.items() if _is_latent(site)]
         if not latent:
-            raise ValueError("model: expected at least one latent sample site, got none")
+            raise ValueError(f"model: expected at least one latent sample site, got {sorted(sites) or 'no site'}")
         for name, site in sites.items():
             if site["type"] == "plate" and (used := len(site["value"])) != site["args"][0]:
                 raise ValueError(
@@ -289,7 +289,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
     def wrap_model(self, wrapper: Callable[[Callable[..., Any]], Callable[..., Any]]) -> "EllipticalSlice":
         """A copy of this kernel with another model; `ValueError` where it has ellipses of the caller's."""
         if self._ellipses is not None:
-            raise ValueError("ellipses: a kernel with its own ellipses cannot follow another model")
+            raise ValueError(f"ellipses: expected None of a kernel that changes its model, got {self._ellipses}")
         kernel = copy.copy(self)
         kernel._model = wrapper(self._model)
         kernel._sample_fn, kernel._log_likelihood = kernel._one_draw, kernel._model_log_likelihood

@@ -55,7 +55,7 @@ def _bridged(
         above = proposal - np.logaddexp(log_share + proposal, log_rest + estimate)
         below = -np.logaddexp(log_share + posterior, log_rest + estimate)
         estimate = float(logsumexp(above) - np.log(len(proposal)) - logsumexp(below) + np.log(len(posterior)))
-    errors = [
+    errors = [  # of the two means of Meng & Wong (1996), eq. 2.3, by the delta method
         np.var(values) / np.mean(values) ** 2 / size
         for values, size in ((np.exp(above - above.max()), number), (np.exp(below - below.max()), effective))
     ]

@@ -94,6 +94,7 @@ def tilted_moments(
     z = np.maximum(constant + np.sum(terms, axis=1), np.finfo(float).tiny)
     # where nothing is left of a tie but rounding, it has no direction either
     lost = z <= LOST * (constant + np.sum(np.abs(terms), axis=1))
+    # Rasmussen & Williams (2006), section 3.9: ∂ log Z/∂μ, ∂² log Z/∂μ², and the moments by both
     slope = np.where(lost, 0, np.sum(density, axis=1)) / z
     curvature = np.where(lost, 0, np.sum(-density * x / spread, axis=1)) / z - slope**2
     tilted_variance = variances + variances**2 * curvature

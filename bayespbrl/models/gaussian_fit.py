@@ -46,7 +46,7 @@ def fit_gaussian(
     """Factorise the differences (K, D) and fit a Gaussian by expectation propagation.
 
     Args:
-      differences, indifferent, number_of_preferences: as of `sample_posterior`.
+      differences, indifferent, number_of_preferences: as in `sample_posterior`.
       model: prior and likelihood; what it infers is at its prior's mean.
     """
     differences = checks.matrix("differences", differences)

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, PRNGKeyArray, Shaped
 from bayespbrl.models.likelihoods import Likelihood, Margins, Scalar, Values, WithLapses, WithTies, has_steps, log_prob
 from bayespbrl.models.preference_problem import PreferenceProblem
 
-# Up to so many answers, padding included, nothing is spared: their moves are others.
+# Up to this many answers, padding included, the sampler makes more moves of other kinds.
 FEW = 64
 STACKED = ("loadings", "used", "centre", "site_precisions", "root", "inverse_root")
 
@@ -54,7 +54,7 @@ class JointProblem(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """The unknowns beside the weights: index of the setting and of each grid's value."""
+    """The unknowns besides the weights: index of the setting and of each grid's value."""
 
     setting: Int[Array, "*chains"]
     steepness: Int[Array, "*chains"]
@@ -156,8 +156,8 @@ def _setting_move(
     points = settings.centre + settings.root @ whitened
     margins = jnp.einsum("skq,sq->sk", settings.loadings, points)
     log_p = log_likelihood(problem, unknowns, margins)
-    log_p -= 0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # log N(z; 0, σ²I)
-    log_p += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A|
+    log_p -= 0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # eq. 7: log N(z; 0, σ²I)
+    log_p += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A| (Green 1995)
     setting = random.categorical(key, log_p + problem.log_probabilities)
     return points[setting], unknowns._replace(setting=setting)
 
@@ -207,8 +207,8 @@ def _scaled(
     """
     scaled = jnp.any(problem.settings.loadings[unknowns.setting] != 0, axis=0)  # all but padding
     points = jnp.where(scaled, scales[:, None] * z, z)
-    log_p -= 0.5 * jnp.sum(points**2, axis=1) / problem.settings.prior_scale**2
-    chosen = random.categorical(key, log_p + jnp.sum(scaled) * jnp.log(scales))
+    log_p -= 0.5 * jnp.sum(points**2, axis=1) / problem.settings.prior_scale**2  # eq. 7: log N(z; 0, σ²I)
+    chosen = random.categorical(key, log_p + jnp.sum(scaled) * jnp.log(scales))  # Green (1995): the volume scale^r
     return points[chosen], chosen
 
 

@@ -3,8 +3,8 @@
 In many dimensions a few answers decide about each, and how many are violated all but fixes the lapse rate: given the
 weights it hardly moves. So the weights are written as quantiles, coordinate by coordinate, each of its distribution
 given the coordinates before it and one answer whose margin has no later coordinate. A normal distribution with a step
-has its quantiles in closed form. The quantiles are kept, the lapse rate is drawn anew with them (a deterministic map
-with its volume, as the setting's move in `gibbs`).
+has its quantiles in closed form. The quantiles are kept, the lapse rate is drawn anew with them: a deterministic map
+with its volume (Green 1995), like the setting's move in `gibbs`.
 """
 
 from typing import NamedTuple
@@ -85,4 +85,4 @@ def transported(
         return points.at[i].set(new), jnp.where(ladder.paired[i], jnp.log(total / each), 0.0)
 
     points, ratios = lax.scan(next_coordinate, jnp.zeros(then.shape[:0:-1], y.dtype), jnp.arange(len(y)))
-    return points.T @ ladder.frame.T, jnp.sum(ratios, axis=0)
+    return points.T @ ladder.frame.T, jnp.sum(ratios, axis=0)  # log volume (Green 1995)

@@ -94,6 +94,7 @@ def _logistic_mixture() -> tuple[Float[np.ndarray, " j"], Float[np.ndarray, " j"
     log_kappa = np.linspace(np.log(0.14), np.log(4.3), 28)
     kappa = np.exp(log_kappa)[:, None]
     n = np.arange(1, 60)
+    # Andrews & Mallows (1974): κ has Kolmogorov's distribution
     large = np.sum((-1.0) ** (n + 1) * 8 * n**2 * kappa * np.exp(-2 * n**2 * kappa**2), axis=1)
     odd = (2 * n - 1) * np.pi / np.sqrt(8)
     small = np.sum(np.sqrt(2 * np.pi) * (2 * odd**2 / kappa**4 - 1 / kappa**2) * np.exp(-((odd / kappa) ** 2)), axis=1)
@@ -127,20 +128,20 @@ class Mixed:
         """A step and a smooth part."""
         weights, scales = _logistic_mixture()
         share = 1 / self.number_of_preferences
-        return _mixture(np.append(share * weights, 1 - share), np.append(scales / self.steepness, 0.0))
+        return _mixture(np.append(share * weights, 1 - share), np.append(scales / self.steepness, 0.0))  # eq. 8
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Logistic:
-    """Bradley–Terry: sigmoid(m t)."""
+    """The sigmoid of eq. 8 alone, sigmoid(m t): the model of Bradley & Terry (1952)."""
 
     steepness: Scalar
 
     def factor(self, margins: Margins) -> tuple[Values, Values]:
         """exp(min(m t, 0)) / (1 + exp(−|m t|))."""
         scaled = self.steepness * margins
-        return jnp.minimum(scaled, 0), 1 / (1 + jnp.exp(-jnp.abs(scaled)))
+        return jnp.minimum(scaled, 0), 1 / (1 + jnp.exp(-jnp.abs(scaled)))  # eq. 8, L_sig
 
     def probit_mixture(self) -> ProbitMixture:
         """The scale mixture of the logistic function."""
@@ -151,13 +152,13 @@ class Logistic:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Probit:
-    """Thurstone: Φ(m t)."""
+    """Φ(m t): the model of Thurstone (1927)."""
 
     steepness: Scalar
 
     def factor(self, margins: Margins) -> tuple[Values, Values]:
         """Φ(m t) itself is the exponential of its logarithm."""
-        exponent = jax.scipy.special.log_ndtr(self.steepness * margins)
+        exponent = jax.scipy.special.log_ndtr(self.steepness * margins)  # Thurstone (1927)
         return exponent, jnp.ones_like(exponent)
 
     def probit_mixture(self) -> ProbitMixture:
@@ -169,6 +170,8 @@ class Probit:
 @dataclass(frozen=True)
 class WithLapses:
     """A constant share of coin tosses around any likelihood: λ/2 + (1 − λ) p, so 20 % wrong answers are λ = 0.4.
+
+    Source: Wichmann & Hill (2001), eq. 1, with equal rates of guesses and lapses.
 
     Attributes:
       attentive: the likelihood p of an answer that is not a coin toss.
@@ -185,13 +188,14 @@ class WithLapses:
         above = exponent > floor
         smaller = jnp.exp(-jnp.abs(exponent - floor))  # of exp(e) and λ/2, over the larger
         lapsed, attentive = jnp.where(above, smaller, 1.0), jnp.where(above, 1.0, smaller)
+        # Wichmann & Hill (2001), eq. 1
         return jnp.maximum(exponent, floor), lapsed + (1 - self.lapse_rate) * attentive * ratio
 
     def probit_mixture(self) -> ProbitMixture:
         """The mixture shrunk, and a constant."""
         constant, weights, offsets, scales = self.attentive.probit_mixture()
         lapses, keep = float(self.lapse_rate), 1 - float(self.lapse_rate)
-        return ProbitMixture(lapses / 2 + keep * constant, keep * weights, offsets, scales)
+        return ProbitMixture(lapses / 2 + keep * constant, keep * weights, offsets, scales)  # Wichmann & Hill (2001)
 
 
 @jax.tree_util.register_dataclass
@@ -220,6 +224,7 @@ class WithTies:
         )
         lower, of_lower = self.ordered.factor(below - self.threshold)
         scale = 1 + 1 / jnp.asarray(self.threshold)
+        # Rao & Kupper (1967): p(tie) = p(t + δ) − p(t − δ)
         left = jnp.maximum(ratio - jnp.exp(lower - exponent) * of_lower, 0) * scale
         return jnp.where(self.indifferent, exponent - jnp.log(scale), exponent), jnp.where(
             self.indifferent, left, ratio
@@ -238,7 +243,7 @@ class WithTies:
 
 
 def has_steps(likelihood: Likelihood) -> bool:
-    """Whether it jumps, as eq. 8 does. Given many answers the posterior of any other is nearly Gaussian."""
+    """Whether the likelihood jumps, as eq. 8 does. Given many answers the posterior of any other is nearly Gaussian."""
     if isinstance(likelihood, WithTies):
         return has_steps(likelihood.ordered)
     return has_steps(likelihood.attentive) if isinstance(likelihood, WithLapses) else isinstance(likelihood, Mixed)
@@ -281,14 +286,17 @@ def smoothed_probability(
 ) -> Float[np.ndarray, "*b k"]:
     """E p(t) over t ~ N(margin, spread²), exactly: each probit of the mixture stays one; for an ordered answer."""
     if isinstance(likelihood, WithLapses):
+        # Wichmann & Hill (2001), eq. 1
         lapses = np.asarray(likelihood.lapse_rate)
         return np.asarray(lapses / 2 + (1 - lapses) * smoothed_probability(likelihood.attentive, margins, spread))
     if isinstance(likelihood, Mixed):
         share = 1 / np.asarray(likelihood.number_of_preferences)
         smooth = smoothed_probability(Logistic(likelihood.steepness), margins, spread)
+        # eq. 8
         return np.asarray((1 - share) * _widened(margins, np.zeros(1), spread) + share * smooth)
     assert isinstance(likelihood, Logistic | Probit)
     weights, scales = _logistic_mixture() if isinstance(likelihood, Logistic) else (np.ones(1), np.ones(1))
+    # Andrews & Mallows (1974): sigmoid = Σⱼ wⱼ Φ(·/hⱼ)
     parts = zip(weights, scales, strict=True)
     return np.asarray(sum(w * _widened(margins, h / np.asarray(likelihood.steepness), spread) for w, h in parts))
 
@@ -296,7 +304,7 @@ def smoothed_probability(
 def _widened(
     margins: Float[np.ndarray, "*b k"], scale: Float[np.ndarray, "..."], spread: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "*b k"]:
-    """Φ(t / √(h² + spread²)), a step where both are zero."""
+    """Φ(t / √(h² + spread²)), a step where both are zero (Rasmussen & Williams 2006, section 3.9)."""
     width = np.broadcast_to(np.hypot(scale, spread), margins.shape)
     step = (1 + np.sign(margins)) / 2
     return np.where(width > 0, ndtr(margins / np.where(width > 0, width, 1.0)), step)

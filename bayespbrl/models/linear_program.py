@@ -43,7 +43,7 @@ def linear_program(differences: ArrayLike) -> LinearProgramResult:
     number, dimension = differences.shape
     if number == 0 or dimension == 0:
         return LinearProgramResult(np.zeros(dimension), 0.0, "nothing to solve", True)
-    # variables (w, p, n): Ψw − p + n = 0, cost −Σ p_k + 2 Σ n_k
+    # eq. 10, with c of eq. 9; variables (w, p, n): Ψw − p + n = 0, cost −Σ p_k + 2 Σ n_k
     constraints = ca.DM(np.hstack([differences, -np.eye(number), np.eye(number)]))
     cost = np.concatenate([np.zeros(dimension), -np.ones(number), 2 * np.ones(number)])
     solver = ca.conic(
@@ -52,7 +52,7 @@ def linear_program(differences: ArrayLike) -> LinearProgramResult:
         {"a": constraints.sparsity(), "h": ca.Sparsity(len(cost), len(cost))},
         {"error_on_fail": False, "highs": {"output_flag": False}},
     )
-    lower = np.concatenate([-np.ones(dimension), np.zeros(2 * number)])
+    lower = np.concatenate([-np.ones(dimension), np.zeros(2 * number)])  # eq. 9: |w_j| ≤ 1
     upper = np.concatenate([np.ones(dimension), np.full(2 * number, np.inf)])
     solution = solver(a=constraints, g=cost, lbx=lower, ubx=upper, lba=0, uba=0)
     statistics = solver.stats()

@@ -31,7 +31,7 @@ from bayespbrl.models.preference_model import NOTHING_ELSE, PreferenceModel
 from bayespbrl.models.preference_problem import PreferenceProblem, low_rank_model, prior_ellipse
 
 LEAST = 16  # draws: half of them are kept, and R̂ needs twice four
-# Decision: of the second half so many draws are kept, equally far apart; the moves between them are not stored.
+# Decision: this many draws of the second half are kept, evenly spaced; the moves between them are not stored.
 KEPT = 1000
 
 
@@ -43,7 +43,7 @@ def plain_draws(
     seed: int,
     number_of_preferences: int | None = None,
 ) -> xr.DataTree:
-    """As `posterior_draws`, by so many plain moves of one chain, of which the first half is discarded.
+    """`posterior_draws` by `draws` plain moves of one chain, of which the first half is discarded.
 
     Args:
       differences: ψ(preferred) − ψ(dominated), shape (K, D), or (1, K, D).
@@ -58,9 +58,13 @@ def plain_draws(
     draws, seed = checks.whole("draws", draws, LEAST), checks.whole("seed", seed, 0)
     settings = settings_of(differences)
     if len(settings) > 1 or model.steepness is None or model.lapse_rate is None:
-        raise ValueError("plain draws: expected given length scales, steepness and lapse rate, got some to be inferred")
+        raise ValueError(
+            "plain draws: expected one setting of the length scales, a steepness and a lapse rate, got "
+            f"{len(settings)}, {model.steepness} and {model.lapse_rate}"
+        )
     number = settings.shape[1] if number_of_preferences is None else number_of_preferences
     fits = [fit_gaussian(settings[0], model, number_of_preferences=number)]
+    # paper, experiments: as many samples for the burn-in as for the evaluation
     half = draws // 2
     kept = min(half, KEPT)
     with jax.enable_x64(True), one_blas_thread():

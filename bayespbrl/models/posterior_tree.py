@@ -174,6 +174,7 @@ def _with_weights(tree: xr.DataTree, bases: Sequence[Float[np.ndarray, "d _"]]) 
         parts = np.zeros((len(bases), width))
         for number, basis in enumerate(bases):
             chosen = settings == number
+            # paper, step 1: the posterior mean μ_w, or the most likely sample
             parts[number] = (basis @ (share[chosen] @ z[chosen][:, : basis.shape[1]]))[:width]
         points[f"utility_weights_{name}"] = (("setting", "feature"), parts) if several else (("feature",), parts[0])
     return _replaced(tree, posterior, xr.Dataset(points, attrs=tree.attrs))

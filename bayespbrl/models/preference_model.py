@@ -72,7 +72,7 @@ class PreferenceModel:
         """
         tied = np.zeros(number_of_preferences, dtype=bool) if indifferent is None else np.asarray(indifferent)
         if tied.ndim != 1 or tied.dtype != bool:
-            raise ValueError(f"indifferent: expected a vector of bool, got {tied.dtype} of shape {tied.shape}")
+            raise ValueError(f"indifferent: expected bool of shape (K,), got {tied.dtype} of shape {tied.shape}")
         threshold = self.tie_threshold is not None or indifferent is not None
         return likelihood_of(
             self.likelihood,
@@ -89,7 +89,7 @@ class Answers:
     """Ties, sides and answerers of K answers; None where they are not known.
 
     Attributes:
-      indifferent, shown_first, answerers: as of `sample_posterior`, shape (K,).
+      indifferent, shown_first, answerers: as in `sample_posterior`, shape (K,).
       names: of the answerers, by number; None: found in `answerers`, or there is one answerer.
     """
 
@@ -181,7 +181,7 @@ def preference_model(
     """
     number, dimension = differences.shape
     weights = numpyro.sample("utility_weights", dist.Normal(0, prior_scale).expand([dimension]).to_event(1))  # eq. 7
-    margins = numpyro.deterministic("margins", differences @ weights)
+    margins = numpyro.deterministic("margins", differences @ weights)  # eq. 5
     # eq. 8; rounding must not lift log p to 0 or above, where the logit is not a number
     log_p = jnp.minimum(log_prob(likelihood, margins), -1e-30)
     with numpyro.plate("preference", number), numpyro.handlers.mask(mask=used):

@@ -76,6 +76,7 @@ def reference_ellipse(problem: PreferenceProblem) -> Ellipse:
     def residual(v: Float[Array, "j v"]) -> Float[Array, " j"]:
         margins, tilt = v[:, :number], v[:, number]
         log_likelihood = total_log_prob(problem.likelihood, margins_at_centre + margins)
+        # Nishihara, Murray & Adams (2014), section 3: prior × likelihood / reference
         return log_likelihood + 0.5 * jnp.sum(problem.site_precisions * margins**2, axis=-1) - tilt
 
     def noise(key: PRNGKeyArray, moves: int) -> Float[Array, "{moves} v"]:
@@ -99,6 +100,7 @@ def _scaled_ellipse(problem: PreferenceProblem, excess: Scalar) -> Ellipse:
         margins, tilt, displacement = v[:, :number], v[:, number], v[:, number + 1 :]
         log_likelihood = total_log_prob(problem.likelihood, margins_at_centre + margins)
         squares = jnp.sum(problem.site_precisions * margins**2, axis=-1) + excess * jnp.sum(displacement**2, axis=-1)
+        # Nishihara, Murray & Adams (2014), section 3: prior × likelihood / reference
         return log_likelihood + 0.5 * squares - tilt
 
     def noise(key: PRNGKeyArray, moves: int) -> Float[Array, "{moves} v"]:
@@ -125,6 +127,7 @@ def axis_ellipse(problem: PreferenceProblem) -> Ellipse:
 
     def turn(v: Float[Array, " v"], fresh: Float[Array, "2"], angles: Float[Array, " j"]) -> Float[Array, "j v"]:
         axis = fresh[0].astype(int)
+        # Murray, Adams & MacKay (2010), figure 2, step 4, in one coordinate
         step = v[number + 1 + axis] * (jnp.cos(angles) - 1) + fresh[1] * jnp.sin(angles)
         return v + step[:, None] * columns[axis]
 
@@ -171,6 +174,7 @@ def padded_problem(
     padded[:number, :rank], centre[:rank] = loadings, mean
     root, inverse_root = prior_scale * np.eye(wide), np.eye(wide) / prior_scale
     if rank:
+        # Rasmussen & Williams (2006), eq. 3.53: I/σ² + Lᵀ diag(s) L
         precision = np.eye(rank) / prior_scale**2 + loadings.T @ (site_precisions[:, None] * loadings)
         # A is lower triangular, as L is: whitened coordinates mean alike under different features
         inverse_root[:rank, :rank] = np.linalg.cholesky(precision[::-1, ::-1])[::-1, ::-1].T

@@ -93,7 +93,7 @@ def flown(
       walls: where the likelihood jumps.
       margins: at the start.
       violated: answers of each answerer at the start.
-      heights: log likelihood of so many violated answers, for each answerer.
+      heights: log likelihood by the number of violated answers, for each answerer.
       duration: in (0, π), radians.
     """
     number, squares = len(walls.normals), jnp.diagonal(walls.products)
@@ -134,6 +134,7 @@ def flown(
     end = lax.while_loop(lambda now: (now.time < duration) & (now.events < most), to_next_wall, start)
     position, velocity = jnp.stack([y, velocity]) + end.kicks.T @ walls.normals
     cos, sin = np.cos(duration), np.sin(duration)
+    # Pakman & Paninski (2014): the motion under a standard normal distribution is a rotation
     return position * cos + velocity * sin, velocity * cos - position * sin, end.time < duration
 
 
@@ -147,7 +148,7 @@ def flight_move(
     heights: Float[Array, "a n"],
     log_likelihood: Callable[[Float[Array, " c"]], Float[Array, ""]],
 ) -> tuple[Float[Array, " q"], Float[Array, " c"], Bool[Array, ""]]:
-    """y and its margins after one flight with a fresh velocity, and whether that was given up; arguments as of `flown`.
+    """y and its margins after one flight with a fresh velocity, and whether that was given up; arguments as in `flown`.
 
     The flight conserves prior × velocities × `heights`, and volumes; the test makes of it the law of `log_likelihood`,
     a function of the margins.
@@ -160,6 +161,7 @@ def flight_move(
     def energy(y: Float[Array, " q"], velocity: Float[Array, " q"], margins: Float[Array, " c"]) -> Float[Array, ""]:
         return 0.5 * jnp.sum(y**2) + 0.5 * jnp.sum(velocity**2) - log_likelihood(margins)
 
+    # Metropolis test (Afshar & Domke 2015)
     lost = energy(y, velocity, margins) - energy(end, at_end, then)
     accepted = (jnp.log(random.uniform(key_test, dtype=y.dtype)) < lost) & ~given_up
     return jnp.where(accepted, end, y), jnp.where(accepted, then, margins), given_up

@@ -27,7 +27,7 @@ def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProb
     margins_at_centre = problem.loadings @ centre
 
     def residual(x: Float[Array, " q"]) -> Float[Array, ""]:
-        """log(posterior / reference) up to a constant, as of `reference_ellipse`."""
+        """log(posterior / reference) up to a constant, as in `reference_ellipse`."""
         displacement = width * (problem.root @ x)
         margins = problem.loadings @ displacement
         log_likelihood = total_log_prob(problem.likelihood, margins_at_centre + margins, problem.used)
@@ -52,6 +52,6 @@ def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProb
     last, _ = lax.scan(step, (x, velocity, value, gradient), None, length=GRADIENTS)
     end, at_end, then, _ = last
     gained = then - value + 0.5 * jnp.sum(x**2 + velocity**2) - 0.5 * jnp.sum(end**2 + at_end**2)
-    # NaN compares as false, so that it is rejected
+    # the Metropolis test of Shahbaba et al. (2014); NaN compares as false, so that it is rejected
     accepted = jnp.log(random.uniform(key_test, dtype=x.dtype)) < gained
     return jnp.where(accepted, centre + width * (problem.root @ end), z)

@@ -35,7 +35,7 @@ class Steps(NamedTuple):
 
     Attributes:
       walls: of each setting, stacked.
-      heights: log likelihood of so many violated answers of each answerer, whatever their lapse rate.
+      heights: log likelihood by the number of violated answers of each answerer, with the lapse rate summed out.
       ladder: of each setting, stacked; None: lapse rates move alone.
     """
 
@@ -98,7 +98,7 @@ def _transport_move(
     walls: Walls,
     ladder: Ladder,
 ) -> tuple[Float[Array, " q"], Unknowns]:
-    """The lapse rate of one answerer drawn anew with the quantiles of the weights kept."""
+    """Draw a new lapse rate for one answerer, keeping the quantiles of the weights."""
     key_who, key_value = random.split(key)
     rates = problem.lapse_rate.values
     who = random.randint(key_who, (), 0, len(problem.answerers))
@@ -136,6 +136,7 @@ def _heights(problem: JointProblem) -> Float[Array, "a n"]:
     right, wrong = (log_prob(likelihood, jnp.full(rates.shape, sign * BESIDE)) for sign in (1, -1))
     given, violated = jnp.sum(problem.answerers, axis=1), jnp.arange(problem.answerers.shape[1] + 1)
     obeyed = given[:, None] - violated
+    # eq. 8 at margins near zero, and the prior of λ
     log_p = obeyed[..., None] * right + violated[:, None] * wrong + problem.lapse_rate.log_probabilities
     return logsumexp(log_p, axis=-1)
 

@@ -77,7 +77,9 @@ class Page:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, port), family=family)
         except OSError as error:
-            raise ValueError(f"port {port} on {host}: cannot listen there ({error})") from error
+            raise ValueError(
+                f"host, port: expected an address to listen on, got {host!r} and {port} ({error})"
+            ) from error
         self.host, self.port = host, self._socket.getsockname()[1]
         config = uvicorn.Config(
             self._application(), log_level="warning", access_log=False, timeout_graceful_shutdown=1, lifespan="off"

@@ -69,13 +69,13 @@ class Session:
         practice: bool = False,
     ):
         if learner.finished:
-            raise ValueError("learner: expected one with questions left, got a finished run")
+            raise ValueError("learner: expected a run with questions left, got a finished run")
         checks.optional(checks.whole, "answers", most_answers)
         names = [answerer] if answerer is None or isinstance(answerer, str) else list(answerer)
         for name in names:
             checks.optional(checks.short_name, "answerer", name)
         if not names or len(set(names)) < len(names):
-            raise ValueError(f"answerer: expected a name for each person, got {names}")
+            raise ValueError(f"answerer: expected a different name for each person, got {names}")
         self.learner, self.most_answers = learner, most_answers
         self.name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
         self.changed = threading.Condition(threading.RLock())
@@ -169,7 +169,7 @@ class Session:
 
     def _undo(self, seat: Seat) -> None:
         if not seat.view["undo"]:
-            raise ValueError("undo: expected an answer of the same person's to take back, got none")
+            raise ValueError("undo: expected an answer by the same person to take back, got none")
         number = self.learner.state.past[-1].number
         self.learner.undo(answerer=seat.answerer)
         self._turn(seat)
@@ -310,11 +310,11 @@ def answer_of(message: Any) -> tuple[int, str, float | None, int | None]:
     """Turn, answer, seconds and replays of a message of the front end; `ValueError` where it is none."""
     names = ("turn", "answer", "seconds", "replays")
     if not isinstance(message, dict) or not set(message) <= set(names):
-        raise ValueError("answer: expected turn, answer, seconds and replays")
+        raise ValueError(f"answer: expected turn, answer, seconds and replays, got {message!r}"[:200])
     turn, answer, seconds, replays = (message.get(name) for name in names)
     if type(turn) is not int or not isinstance(answer, str):
         raise ValueError(f"answer: expected the number of a turn and an answer, got {turn!r} and {answer!r}"[:200])
     checks.optional(checks.number, "seconds", seconds)
     if replays is not None and (type(replays) is not int or not 0 <= replays <= events.MOST_REPLAYS):
-        raise ValueError(f"replays: expected a whole number from 0 to {events.MOST_REPLAYS}")
+        raise ValueError(f"replays: expected a whole number from 0 to {events.MOST_REPLAYS}, got {replays!r}"[:200])
     return turn, answer, seconds, replays

@@ -103,14 +103,14 @@ def with_ties(
 
 
 def notice(given: int, *, practised: bool) -> str:
-    """A quiet line beside a question, after so many answers of a sitting."""
+    """A short notice beside a question, by the number of answers in this sitting."""
     if given > 0 and given % BREAK == 0:
         return f"You have given {given} answers. Pause when you like; nothing is lost."
     return "The practice is over. From now on your answers are kept." if practised and not given else ""
 
 
 def ending(learner: Learner, state: LearnerState, given: int) -> str:
-    """Why there is no further question, after so many answers of a sitting."""
+    """Why there is no further question, by the number of answers in this sitting."""
     answers, budget = state.preferences.answers, learner.settings.questions.answers
     if not state.finished(learner.settings):
         these = f"These were the {given} answers" if given != 1 else "This was the one answer"

@@ -67,7 +67,9 @@ class Actor:
         if not deterministic or isinstance(policy, Greedy):
             return self._drawn(policy, observation)
         if not is_discrete(policy):
-            raise ValueError(f"deterministic: expected a policy with a method mode, got {type(policy).__name__}")
+            raise ValueError(
+                f"deterministic: expected a policy with a method mode or probabilities, got {type(policy).__name__}"
+            )
         rows = np.asarray(self.observe(observation))[None]
         return int(self.enact(int(np.argmax(policy.probabilities(rows)[0]))))
 

@@ -1,4 +1,4 @@
-"""A policy at many observations: any N, in chunks of one size, so that each function compiles once a policy type."""
+"""A policy at many observations: any N, in chunks of one size, so that each function compiles once per policy type."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ def _sample_chunk(
     policy: Sampler, key: Key[Array, ""], start: Shaped[AnyArray, ""], observations: Shaped[AnyArray, "n ..."]
 ) -> Shaped[Array, "n ..."]:
     rows = start + jnp.arange(CHUNK, dtype=jnp.uint32)
-    # one key a row, made from the row's number: the padding and the chunk size cannot change what a row draws
+    # one key per row, made from the row's number: the padding and the chunk size cannot change what a row draws
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, rows)
     return jax.vmap(policy.sample)(keys, observations)
 
@@ -49,7 +49,7 @@ def log_probabilities(policy: Policy, observations: ArrayLike, actions: ArrayLik
     """log π(aᵢ|sᵢ) for each row."""
     observations, actions = np.asarray(observations), np.asarray(actions)
     if len(observations) != len(actions):
-        raise ValueError(f"actions: expected {len(observations)} rows, one an observation, got {len(actions)}")
+        raise ValueError(f"actions: expected {len(observations)} rows, one for each observation, got {len(actions)}")
     with jax.enable_x64(True):
         return _in_chunks(lambda _, *rows: _log_prob_chunk(policy, *rows), observations, actions)
 

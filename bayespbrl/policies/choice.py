@@ -53,5 +53,5 @@ def initial_policy(
         else:
             kind = "tabular" if isinstance(observation_space, Discrete) else "softmax"
     if kind not in POLICIES:
-        raise ValueError(f"policy: expected auto, {', '.join(POLICIES)} to start from, got {kind!r}")
+        raise ValueError(f"policy: expected one of auto, {', '.join(POLICIES)}, got {kind!r}")
     return POLICIES[kind]((observation_space, action_space), action_scale, period)

@@ -1,4 +1,4 @@
-"""The Gaussian process policy (paper, step 2, "Obtaining a new exploration policy"): weighted, sparse, one a dimension.
+"""The Gaussian process policy (paper, "Obtaining a new exploration policy"): weighted, sparse, one per dimension.
 
 a_j ~ N(mean_j(s), var_j(s)) in each action dimension j, not clipped. The prior mean is the centre of the action's
 range; far from all samples the policy returns to it, and to the variance s² + σ².
@@ -43,7 +43,7 @@ class GaussianProcessPolicy:
       period: infinite where not periodic.
       minimum_noise: lower bound of σ as a fraction of the action's range.
       fits: how many fits led here; zero for the initial policy.
-      objective: of the last hyper-parameter search, a unit of weight; NaN where there was none.
+      objective: of the last hyper-parameter search, per unit of weight; NaN where there was none.
       noise_at_bound: whether the last search left σ² on a bound.
     """
 
@@ -76,7 +76,7 @@ class GaussianProcessPolicy:
 
         Args:
           period: of each observation dimension, infinite where not periodic; None for none.
-          initial_scale: standard deviation as a multiple of the range high − low, one number or one a dimension.
+          initial_scale: standard deviation as a multiple of the range high − low, one number or one per dimension.
           number_of_inducing_points: M.
           minimum_noise: the noise σ never falls below this fraction of the range.
         """
@@ -113,6 +113,7 @@ class GaussianProcessPolicy:
             return correlations @ mean_weights, jnp.sum(jnp.square(reduction @ correlations))
 
         mean, explained = jax.vmap(one)(self.inducing_points, self.bandwidths, self.mean_weights, self.reduction)
+        # Snelson & Ghahramani (2006), predictive mean and variance, as in `SparseRegression`
         variance = jnp.asarray(self.signal_variance) * jnp.maximum(1.0 - explained, 0.0) + self.noise_variance
         return jnp.asarray(self.action_centre) + mean, variance
 
@@ -131,7 +132,7 @@ class GaussianProcessPolicy:
         return -0.5 * jnp.sum(jnp.square(action - mean) / variance + jnp.log(2 * jnp.pi * variance))
 
     def entropy(self, observation: Float[AnyArray, " s"]) -> Float[Array, ""]:
-        """Differential entropy of π(·|s) in nats."""
+        """Differential entropy of π(·|s) in nats (Rasmussen & Williams 2006, section A.5)."""
         return 0.5 * jnp.sum(jnp.log(2 * jnp.pi * jnp.e * self.moments(observation)[1]))
 
     def mean_and_variance(self, observations: ArrayLike) -> tuple[Float[np.ndarray, "n a"], Float[np.ndarray, "n a"]]:
@@ -145,6 +146,7 @@ class GaussianProcessPolicy:
             means.append(correlations @ mean_weights)
             explained.append(np.square(correlations @ reduction.T).sum(axis=1))
         left = np.maximum(1.0 - np.stack(explained, axis=1), 0.0)
+        # Snelson & Ghahramani (2006), predictive mean and variance
         variance = np.asarray(self.signal_variance) * left + np.asarray(self.noise_variance)
         return np.asarray(self.action_centre) + np.stack(means, axis=1), variance
 
@@ -153,7 +155,7 @@ class GaussianProcessPolicy:
         return np.sqrt(self.mean_and_variance(observations)[1])
 
     def kl_divergence(self, old: Self, observations: ArrayLike) -> Float[np.ndarray, " n"]:
-        """KL(self ‖ old) of the two normal distributions at each of N observations."""
+        """KL(self ‖ old) of two normal distributions at N observations (Rasmussen & Williams 2006, section A.5)."""
         mean, variance = self.mean_and_variance(observations)
         old_mean, old_variance = old.mean_and_variance(observations)
         ratio = variance / old_variance
@@ -171,7 +173,7 @@ class GaussianProcessPolicy:
         base_weights: ArrayLike | None = None,
         evaluations: int | None = None,
     ) -> Self:
-        """Condition the prior on samples with noise σ²/wᵢ, at new inducing points and hyper-parameters.
+        """Condition the prior on samples with noise σ²/wᵢ (eq. 14), at new inducing points and hyper-parameters.
 
         The weights' scale matters, for σ² is the noise of a sample of weight one: wᵢ of mean 1 under W.
 

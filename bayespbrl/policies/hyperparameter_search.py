@@ -1,4 +1,4 @@
-"""Hyper-parameters of the Gaussian process policy by CMA-ES after each iteration (paper, experiments).
+"""Hyper-parameters of the Gaussian process policy by CMA-ES (Hansen & Ostermeier 2001; paper, experiments).
 
 Decision: the objective is the weighted predictive log-likelihood of two held-out halves, not the paper's training-set
 error, which cannot identify the noise variance. It is computed on a random subsample of bounded size and with few
@@ -17,7 +17,7 @@ from bayespbrl.policies.sparse_regression import inducing_rows, inverse_factor, 
 
 SUBSAMPLE, INDUCING_POINTS = 800, 50  # what the objective is computed with
 FAILED = 1e10  # the cost of hyper-parameters at which the linear algebra breaks down
-PerSample = Float[np.ndarray, " n"]  # one number a sample
+PerSample = Float[np.ndarray, " n"]  # one number per sample
 Logarithms = Float[np.ndarray, " p"]  # of the hyper-parameters searched
 
 
@@ -44,7 +44,7 @@ class OutputSamples:
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
-    """Of one output: bandwidths in the observation's units, variances in the action's units squared."""
+    """Hyper-parameters of one output: bandwidths in the observation's units, variances in the action's squared."""
 
     bandwidths: Float[np.ndarray, " s"]
     signal_variance: float
@@ -70,7 +70,7 @@ class SearchResult:
 
     Attributes:
       hyperparameters: the best ones seen, the start included.
-      objective: their log-likelihood a unit of weight (nats).
+      objective: their log-likelihood per unit of weight (nats).
       at_bound: whether the best noise variance lies on one of its bounds.
     """
 
@@ -153,6 +153,7 @@ def _cost(samples: OutputSamples, start: Hyperparameters, rng: np.random.Generat
             for train, test in folds:
                 mean, variance = _predict(whitened, samples, train, test, parameters)
                 errors = np.square(samples.targets[test] - mean)
+                # Rasmussen & Williams (2006), eq. 5.10, weighted
                 total += float(samples.weights[test] @ (0.5 * (errors / variance + np.log(2 * np.pi * variance))))
         except np.linalg.LinAlgError:
             return FAILED

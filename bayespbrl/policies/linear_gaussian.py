@@ -16,7 +16,7 @@ from bayespbrl.policies.policy import AnyArray
 from bayespbrl.policies.samples import location_and_deviation, weighted_samples
 from bayespbrl.policies.spaces import centre_and_range, dimension, initial_deviation
 
-RIDGE = 1e-8  # a unit of weight, in standardised features: decides only what the samples leave open
+RIDGE = 1e-8  # per unit of weight, in standardised features: decides only what the samples leave open
 
 
 @jax.tree_util.register_dataclass
@@ -50,7 +50,7 @@ class LinearGaussianPolicy:
     ) -> Self:
         """The same normal distribution everywhere, about the centre of the action's range.
 
-        `initial_scale` is its standard deviation as a multiple of the range high − low, one number or one a dimension.
+        `initial_scale` is its standard deviation in multiples of the range high − low, one number or one per dimension.
         """
         states, actions = dimension("observation_space", observation_space), dimension("action_space", action_space)
         centre, width = centre_and_range("action_space", action_space)
@@ -86,7 +86,7 @@ class LinearGaussianPolicy:
         )
 
     def entropy(self, observation: Float[AnyArray, " s"]) -> Float[Array, ""]:
-        """Differential entropy of π(·|s) in nats, the same at every observation."""
+        """Differential entropy of π(·|s) in nats, the same everywhere (Rasmussen & Williams 2006, section A.5)."""
         factor = jnp.asarray(self.factor)
         return 0.5 * len(factor) * jnp.log(2 * jnp.pi * jnp.e) + _half_log_determinant(factor)
 
@@ -96,7 +96,7 @@ class LinearGaussianPolicy:
         return np.tile(deviation, (len(np.asarray(observations)), 1))
 
     def kl_divergence(self, old: Self, observations: ArrayLike) -> Float[np.ndarray, " n"]:
-        """KL(self ‖ old) of the two normal distributions at each of N observations."""
+        """KL(self ‖ old) of two normal distributions at N observations (Rasmussen & Williams 2006, section A.5)."""
         new_factor, old_factor = np.asarray(self.factor), np.asarray(old.factor)
         difference = np.linalg.solve(old_factor, (self._means(observations) - old._means(observations)).T)
         ratio = np.linalg.solve(old_factor, new_factor)  # lower triangular: its squares sum to the trace term
@@ -130,7 +130,7 @@ class LinearGaussianPolicy:
         location, deviation = location_and_deviation(samples.observations, shares)
         scale = np.where(deviation > 0, deviation, 1.0)  # a constant dimension keeps a slope of zero
         standardised = (samples.observations - location) / scale
-        centre = shares @ samples.actions
+        centre = shares @ samples.actions  # eq. 14
         weighted = standardised * shares[:, None]
         gram = weighted.T @ standardised + RIDGE * np.eye(dimensions)
         slopes = np.linalg.solve(gram, weighted.T @ (samples.actions - centre)).T  # eq. 14

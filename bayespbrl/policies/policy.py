@@ -84,7 +84,7 @@ class ContinuousPolicy(Policy, Protocol):
     """A policy over vectors of actions."""
 
     def action_standard_deviation(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
-        """Of each dimension of the action at each of N observations."""
+        """Standard deviation of each action dimension at each of N observations."""
         ...
 
 

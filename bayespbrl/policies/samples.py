@@ -36,15 +36,16 @@ def weighted_samples(
     number = len(observations)
     if number == 0 or len(actions) != number:
         raise ValueError(
-            f"actions: expected one row for each of at least one observation, got {len(actions)} actions "
-            f"for {number} observations"
+            f"actions: expected as many rows as observations, at least one, got {len(actions)} and {number}"
         )
     weights = _checked_weights("sample_weights", sample_weights, number)
     if base_weights is not None:
         base = _checked_weights("base_weights", base_weights, number)
-        weights = weights * base * (number / base.sum())
+        weights = weights * base * (number / base.sum())  # pᵢ = Wᵢwᵢ of eq. 14, times N
         if not weights.sum() > 0:
-            raise ValueError("sample_weights: expected some mass where base_weights have some, got none")
+            raise ValueError(
+                "sample_weights: expected a positive weight where base_weights are positive, got only zeros there"
+            )
     kept = weights > 0
     return WeightedSamples(observations[kept], actions[kept], weights[kept])
 
@@ -63,7 +64,9 @@ def _checked_weights(name: str, weights: ArrayLike, number: int) -> Float[np.nda
     if weights.shape != (number,):
         raise ValueError(f"{name}: expected shape ({number},), got {weights.shape}")
     if not np.isfinite(weights).all() or weights.min() < 0:
-        raise ValueError(f"{name}: expected finite numbers ≥ 0, got NaN, infinity or a negative weight")
+        raise ValueError(
+            f"{name}: expected finite numbers >= 0, got {weights[~(np.isfinite(weights) & (weights >= 0))][0]}"
+        )
     if not weights.sum() > 0:
-        raise ValueError(f"{name}: expected at least one positive weight, got none")
+        raise ValueError(f"{name}: expected at least one positive weight, got {number} zeros")
     return weights

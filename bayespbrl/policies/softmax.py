@@ -1,7 +1,8 @@
 """A softmax policy for discrete actions in continuous states, by weighted multinomial logistic regression (eq. 14).
 
 π(a|s) ∝ exp f_a(s), each f_a a sparse Gaussian process (a linear function plus radial basis functions whose prior is
-that of the process), fitted by maximum a posteriori: the discrete sibling of the Gaussian process policy.
+that of the process), fitted by maximum a posteriori: the discrete sibling of the Gaussian process policy
+(Rasmussen & Williams 2006, eq. 3.34 and, for the sparse process, section 8.3.1).
 """
 
 from dataclasses import dataclass, replace
@@ -43,7 +44,7 @@ class SoftmaxPolicy:
       prior_scale: prior standard deviation of each logit's three parts.
       fits: how many fits led here.
       converged: whether the last fit reached its optimum; true of the initial policy.
-      newton_decrement: twice what the last fit has left to gain, by its quadratic model; nats a unit of weight.
+      newton_decrement: twice what the last fit has left to gain, by its quadratic model; nats per unit of weight.
     """
 
     intercepts: Float[AnyArray, " a"]
@@ -143,7 +144,7 @@ class SoftmaxPolicy:
         rng: np.random.Generator,
         base_weights: ArrayLike | None = None,
     ) -> Self:
-        """Maximum a posteriori of the weighted likelihood, at new centres, by Newton's method.
+        """Maximum a posteriori of the weighted likelihood (eq. 14), at new centres, by Newton's method.
 
         A weight counts samples: its scale matters as far as the prior does.
 
@@ -199,6 +200,8 @@ def _logistic_regression(
     """argmax Σₙₐ massₙₐ log softmax(designₙ · weightsᵀ)ₐ − |weights|²/(2 prior_scale²); last decrement, convergence.
 
     Newton's method with a halved step where the full one does not descend; the loss is strictly convex.
+
+    Source: Boyd & Vandenberghe (2004), algorithms 9.2 and 9.5.
     """
     actions, size = mass.shape[1], design.shape[1]
     precision = 1 / (prior_scale**2 * mass.sum())

@@ -24,7 +24,7 @@ def dimension(name: str, space: Space[Any]) -> int:
 
 
 def centre_and_range(name: str, space: Space[Any]) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " a"]]:
-    """(low + high)/2 and high − low of a `Box`, per dimension; 0 and 2, as of [−1, 1], where a bound is infinite."""
+    """(low + high)/2 and high − low of a `Box`, per dimension; 0 and 2, as for [−1, 1], where a bound is infinite."""
     if not isinstance(space, Box):
         raise ValueError(f"{name}: expected a Box, got {space}")
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -36,7 +36,7 @@ def centre_and_range(name: str, space: Space[Any]) -> tuple[Float[np.ndarray, " 
 
 
 def initial_deviation(initial_scale: ArrayLike, action_range: Float[np.ndarray, " a"]) -> Float[np.ndarray, " a"]:
-    """Standard deviation of each action dimension: `initial_scale`, one number or one a dimension, times the range."""
+    """Standard deviation per action dimension: `initial_scale`, one number or one per dimension, times the range."""
     scale = np.broadcast_to(np.asarray(initial_scale, dtype=np.float64), action_range.shape)
     if not np.all((scale > 0) & np.isfinite(scale)):
         raise ValueError(f"initial_scale: expected finite numbers > 0, got {initial_scale!r}")

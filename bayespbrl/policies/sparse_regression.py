@@ -1,4 +1,4 @@
-"""Weighted sparse Gaussian process regression: FITC with the noise σ²/wᵢ a sample.
+"""Weighted sparse Gaussian process regression: FITC with the noise σ²/wᵢ of each sample.
 
 FITC: Snelson and Ghahramani (2006), Sparse Gaussian processes using pseudo-inputs. Weights: Kober, Oztop and Peters
 (2010), Reinforcement learning to adjust robot movements to new situations. Everything is written in v(x) = L⁻¹r(x),
@@ -19,7 +19,7 @@ from bayespbrl.kernels import squared_exponential
 
 JITTER = 1e-8  # relative to the signal variance; the kernel's rounding errors are near 1e-14
 CANDIDATES = 2000  # rows among which the inducing points are chosen
-PerSample = Float[np.ndarray, " n"]  # one number a sample
+PerSample = Float[np.ndarray, " n"]  # one number per sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def fit_sparse_regression(
 def inducing_rows(
     points: Float[np.ndarray, "n e"], weights: PerSample, number: int, *, rng: np.random.Generator
 ) -> Int[np.ndarray, " m"]:
-    """Rows of `points` to induce from: where the weight lies, and no two where one would do.
+    """Rows of `points` as inducing points: where the weight lies, and no two where one would do.
 
     Randomly pivoted Cholesky (Chen, Epperly, Tropp and Webber 2023): each next row is drawn in proportion to the prior
     variance that the rows before it leave unexplained, among `CANDIDATES` rows drawn in proportion to their weight.
@@ -89,7 +89,8 @@ def inducing_rows(
       weights: > 0.
       number: M; fewer rows come back where they already explain every candidate.
     """
-    keys = np.log(weights) + rng.gumbel(size=len(weights))  # the largest keys: a draw by weight without replacement
+    # Kool, van Hoof & Welling (2019): the largest keys are a draw by weight without replacement
+    keys = np.log(weights) + rng.gumbel(size=len(weights))
     size = min(CANDIDATES, len(points))
     chosen = np.sort(np.argpartition(-keys, size - 1)[:size])
     pool = points[chosen]
@@ -99,6 +100,7 @@ def inducing_rows(
     while len(pivots) < len(factors) and unexplained.max() > JITTER:
         rank = len(pivots)
         cumulative = np.cumsum(unexplained)
+        # Chen et al. (2023): a pivot drawn by the residual diagonal, then a column of the partial Cholesky factor
         pivot = int(np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right"))
         pivot = min(pivot, size - 1)
         column = squared_exponential(pool, pool[pivot : pivot + 1])[:, 0]

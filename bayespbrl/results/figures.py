@@ -11,7 +11,7 @@ LEVELS = np.linspace(0, 1.1, 111)
 
 
 def curves_figure(data: StudyData) -> Figure:
-    """Median and quartiles of the value over answers, one panel a task."""
+    """Median and quartiles of the value over answers, one panel per task."""
     tasks = data.tasks
     figure = new_figure(4.5 * len(tasks), 4)
     for axes, task in zip(np.atleast_1d(figure.subplots(1, len(tasks))), tasks, strict=True):
@@ -29,7 +29,7 @@ def curves_figure(data: StudyData) -> Figure:
 
 
 def profiles_figure(data: StudyData) -> Figure | None:
-    """Performance profiles over the tasks that have floor and ceiling, one curve a method; None without any."""
+    """Performance profiles over the tasks that have floor and ceiling, one curve per method; None without any."""
     relative: dict[str, dict[str, np.ndarray]] = {}
     for task in data.tasks:
         if (scale := data.floor_and_ceiling(task)) is None:

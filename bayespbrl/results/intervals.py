@@ -1,7 +1,7 @@
 """Estimates with their intervals: medians, differences, answers needed, failed trials, performance profiles, p values.
 
-All intervals are 95 % intervals. Bootstrap intervals are percentile intervals over the trials, from 10 000 resamples of
-a fixed stream, so that the same data give the same table.
+All intervals are 95 % intervals. Bootstrap intervals are percentile intervals (Efron & Tibshirani 1993) over the
+trials, from 10 000 resamples of a fixed stream, so that the same data give the same table.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,6 +52,8 @@ def paired_difference(values: np.ndarray, reference: np.ndarray) -> tuple[Interv
 
     Args:
       values, reference: of the same seeds, shape (S,).
+
+    Source: Wilcoxon (1945); differences of zero as by Pratt (1959).
     """
     differences = np.asarray(values, dtype=np.float64) - np.asarray(reference, dtype=np.float64)
     if len(differences) < 2 or not np.any(differences):
@@ -94,7 +96,7 @@ def holm(p: Sequence[float]) -> np.ndarray:
     """p values adjusted to control the family-wise error rate (Holm 1979), in the given order."""
     values = np.asarray(p, dtype=np.float64)
     order = np.argsort(values, kind="stable")
-    adjusted = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1.0)
+    adjusted = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1.0)  # Holm (1979)
     result = np.empty_like(values)
     result[order] = adjusted
     return result
@@ -129,7 +131,7 @@ def performance_profile(relative: Mapping[str, np.ndarray], levels: np.ndarray) 
     """
     shares, samples = [], []
     for values in relative.values():
-        above = np.asarray(values, dtype=np.float64)[:, None] > levels
+        above = np.asarray(values, dtype=np.float64)[:, None] > levels  # Agarwal et al. (2021), eq. 2
         shares.append(above.mean(axis=0))
         samples.append(above[resamples(len(values), samples=PROFILE_RESAMPLES)].mean(axis=1))
     tail = (1 - LEVEL) / 2

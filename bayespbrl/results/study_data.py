@@ -42,7 +42,7 @@ class RowData:
     lines: pd.DataFrame
 
     def at(self, answers: float) -> np.ndarray | None:
-        """Value of each trial after so many answers; None where some trial has no policy by then."""
+        """Value of each trial after that many answers; None where some trial has no policy by then."""
         reached = np.flatnonzero(self.answers <= answers)
         return self.values[:, reached[-1]] if len(reached) else None
 

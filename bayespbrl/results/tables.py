@@ -91,7 +91,7 @@ def _of_trials(row: RowData, scale: tuple[float, float] | None, report_at: tuple
 
 
 def _compared(row: RowData, reference: RowData) -> tuple[str, float, str]:
-    """The paired difference to the reference after as many answers as all trials of both gave; p; that number."""
+    """Paired difference to the reference after the most answers that all trials of both gave; p; that number."""
     shared = sorted(set(row.seeds) & set(reference.seeds))
     budget = int(min(row.used.min(), reference.used.min()))
     both = row.at(budget), reference.at(budget)

@@ -23,7 +23,7 @@ TITLES = {
 
 
 def refreshed(directory: Path) -> StudyData:
-    """The data of a study, first written anew from the run directories where these are there, of this version."""
+    """The data of a study, first rewritten from its run directories where this version made them."""
     description = read_study_json(directory)
     declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
     ours = description.get("version") == version("bayespbrl")

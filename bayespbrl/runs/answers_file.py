@@ -1,4 +1,4 @@
-"""Answers as a table, one line a question: `preferences.csv` of a run, and answers that were collected elsewhere."""
+"""Answers as a table, one line per question: `preferences.csv` of a run, and answers that were collected elsewhere."""
 
 import csv
 import io
@@ -51,7 +51,7 @@ def write_answers(file: Path | str, past: Sequence[PastQuestion]) -> Path:
     try:
         write_file(file, table.getvalue())
     except OSError as error:
-        raise ValueError(f"{file}: cannot write the answers there ({error})") from error
+        raise ValueError(f"{file}: expected a place where the answers can be written, got {error}") from error
     return file
 
 
@@ -68,8 +68,10 @@ def read_answers(file: Path | str) -> CollectedAnswers:
     file = Path(file)
     try:
         lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8"), newline=""))
-        if missing := [name for name in NEEDED if name not in (lines.fieldnames or ())]:
-            raise ValueError(f"expected the columns {', '.join(NEEDED)}, got none named {', '.join(missing)}")
+        if not set(NEEDED) <= set(lines.fieldnames or ()):
+            raise ValueError(
+                f"expected the columns {', '.join(NEEDED)}, got {', '.join(lines.fieldnames or ()) or 'none'}"
+            )
         rows = [_row(line, lines.line_num) for line in lines]
     except (OSError, ValueError, csv.Error) as error:
         raise ValueError(f"{file}: {error}") from error

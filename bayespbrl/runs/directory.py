@@ -45,7 +45,7 @@ class RunDirectory:
         """
         path = Path(path)
         if path.exists() or path.is_symlink():
-            raise ValueError(f"{path}: expected a run directory that does not exist yet, got an existing one")
+            raise ValueError(f"{path}: expected a run directory that does not exist yet, got one that exists")
         content = {"format": FORMAT, "version": version("bayespbrl"), "env": settings.env, **settings.options()}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,7 +59,7 @@ class RunDirectory:
                 shutil.rmtree(building, ignore_errors=True)
                 raise
         except OSError as error:
-            raise ValueError(f"{path}: cannot make a run directory there ({error})") from error
+            raise ValueError(f"{path}: expected a place where a run directory can be made, got {error}") from error
         made = cls(path, settings)
         made._end = 0
         return made
@@ -71,7 +71,7 @@ class RunDirectory:
         file = path / "settings.json"
         content = _read_json(file, f"{path}: expected a run directory with its settings.json")
         if not isinstance(content, dict) or not isinstance(content.get("format"), int):
-            raise ValueError(f"{file}: expected the settings of a run, got a foreign file")
+            raise ValueError(f"{file}: expected the settings of a run, got {str(content)[:60]}")
         if content["format"] > FORMAT:
             raise ValueError(f"{file}: expected format {FORMAT}, got {content['format']} of a newer version")
         if content["format"] < FORMAT:
@@ -91,7 +91,7 @@ class RunDirectory:
         """`ValueError` where another learner has written to the run since this one's last event."""
         if self._end is not None and self._end != self._log_size():
             raise ValueError(
-                f"{self.path}: expected the run as this learner left it, but another learner has written to it; "
+                f"{self.path}: expected the run as this learner left it, got events that another learner has written; "
                 "resume the run to continue from there"
             )
 
@@ -234,7 +234,7 @@ def read_summary(directory: Path | str) -> dict[str, Any]:
     file = Path(directory) / "summary.json"
     summary = _read_json(file, f"{file}: expected the summary of a run")
     if not isinstance(summary, dict) or not {"seed", "finished", "iterations"} <= set(summary):
-        raise ValueError(f"{file}: expected the summary of a run, got a foreign file")
+        raise ValueError(f"{file}: expected the summary of a run, got {str(summary)[:60]}")
     return summary
 
 
@@ -248,7 +248,8 @@ def read_complete_summary(directory: Path | str) -> dict[str, Any]:
         if not has_figures(entry):
             raise ValueError(f"{file}: expected answers and value in iteration {number}, got {str(entry)[:60]}")
     if type(summary["seed"]) is not int or not isinstance(summary.get("env"), str) or "utility" not in summary:
-        raise ValueError(f"{file}: expected seed, env and utility of a run, got others")
+        figures = {name: summary.get(name) for name in ("seed", "env", "utility")}
+        raise ValueError(f"{file}: expected seed, env and utility of a run, got {str(figures)[:120]}")
     return summary
 
 

@@ -36,7 +36,7 @@ def write_iteration(file: Path, entry: Entry) -> None:
 def read_iteration(
     file: Path, event: str, *, features: StateFeatures | None = None, known: Sequence[type] = ()
 ) -> dict[str, Any]:
-    """The heavy parts of an event, `collected` or `improved`. Arguments and errors as of `read_parts`."""
+    """The heavy parts of an event, `collected` or `improved`. Arguments and errors as in `read_parts`."""
     return read_parts(file, PARTS[event], features=features, known=known)
 
 
@@ -78,18 +78,18 @@ def read_parts(
 
 
 def _check_size(file: Path, tree: xr.DataTree) -> None:
-    """That a file does not claim more than it holds: what a run writes is not compressed."""
+    """Check that a file does not claim more than it holds: what a run writes is not compressed."""
     claimed, held = sum(node.dataset.nbytes for node in tree.subtree), file.stat().st_size
     if claimed > MOST_BYTES_A_BYTE * held:
         raise ValueError(f"{claimed} bytes of arrays in a file of {held} bytes")
 
 
 def _check_numbers(tree: xr.DataTree) -> None:
-    """That all arrays are numbers; labels of the posterior's dimensions may be text."""
+    """Check that all arrays are numbers; labels of the posterior's dimensions may be text."""
     for node in tree.subtree:
         for name, variable in node.data_vars.items():
             if variable.dtype.kind not in "biuf":
-                raise ValueError(f"expected numbers as {name}, got {variable.dtype}")
+                raise ValueError(f"{variable.dtype} instead of numbers as {name}")
 
 
 def _trajectories_dataset(trajectories: Sequence[Trajectory]) -> xr.Dataset:
@@ -118,7 +118,7 @@ def _trajectories_dataset(trajectories: Sequence[Trajectory]) -> xr.Dataset:
 def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
     states, actions, rewards = data["states"].values, data["actions"].values, data["rewards"].values
     if np.any(data["length"].values > actions.shape[1]):
-        raise ValueError(f"expected at most {actions.shape[1]} steps, got {data['length'].values.max()}")
+        raise ValueError(f"a trajectory of {data['length'].values.max()} steps in a table of {actions.shape[1]}")
     return tuple(
         Trajectory(
             states[i, : length + 1], actions[i, :length], rewards[i, :length], bool(data["terminated"].values[i])
@@ -148,7 +148,7 @@ def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Seq
         given["posterior"] = restored(xr.DataTree(tree.children["fit"].to_dataset(), children=groups))
     if utility.attrs.get("features") == "other":
         if features is None:
-            raise ValueError("a run with features of the user's own: pass them again as features=")
+            raise ValueError("an estimate with features of your own: pass them again as features=")
         given["features"] = features
     if "class" not in utility.attrs:  # by an earlier version: the posterior's groups say which of two it is
         numbers = {name: float(utility.attrs[name]) for name in ("discount", "scale") if name in utility.attrs}

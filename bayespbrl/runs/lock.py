@@ -28,7 +28,7 @@ def continuing(directory: Path | str) -> Iterator[None]:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 raise ValueError(
-                    f"{directory}: this run is being continued elsewhere; stop that program first"
+                    f"{directory}: expected a run that no other program continues, got one that does; stop it first"
                 ) from error
         yield
     finally:

@@ -33,9 +33,9 @@ def start(
     """A new learner that keeps its events in a run directory.
 
     Args:
-      env: as of `Learner`.
+      env: as in `Learner`.
       directory: must not exist; a fresh one under `runs/` when None.
-      **options: as of `Learner`. `expert="other"` is for an expert of your own: such a run continues in Python only,
+      **options: as in `Learner`. `expert="other"` is for an expert of your own: such a run continues in Python only,
         not with `bayespbrl resume`.
 
     Raises:
@@ -86,7 +86,7 @@ def load(
     query: QueryRule | None = None,
     import_package: bool = False,
 ) -> "Run":
-    """A run, finished or in progress, read without changing it. Arguments and errors as of `resume`.
+    """A run, finished or in progress, read without changing it. Arguments and errors as in `resume`.
 
     A schedule and a query rule of your own are needed only to continue a run, not to read it.
     """
@@ -102,8 +102,8 @@ def load(
 def _check_import(log: RunDirectory, env: AnyEnvironment | None, permitted: bool) -> None:
     if env is None and not permitted and (package := imported_by_name(log.settings.env)):
         raise ValueError(
-            f"{log.path}: the environment {log.settings.env} needs the package {package!r}, which is not imported "
-            "unless you say so: import_package=True, or --import-package on the command line"
+            f"{log.path}: expected permission to import {package!r}, which {log.settings.env} needs, got none: "
+            "import_package=True, or --import-package on the command line"
         )
 
 
@@ -112,10 +112,10 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
     settings = log.settings
     for name, given in own.items():
         if (settings.options()[name] == "other") != (given is not None):
-            had, expected = ("without", "no") if given is not None else ("with", "it again as")
-            raise ValueError(f"{log.path}: a run {had} {name} of the user's own: expected {expected} {name}=")
+            expected = f"{name}= again, which the run was started with" if given is None else f"no {name}="
+            raise ValueError(f"{log.path}: expected {expected}, got {given!r}")
     if settings.environment == "other" and env is None:
-        raise ValueError(f"{log.path}: a run with an environment of the user's own: expected it again as env=")
+        raise ValueError(f"{log.path}: expected env= again, which the run was started with, got None")
     summarised, policy = log.summarised(), own["policy"]
     entries = log.entries(features=own["features"], known=() if policy is None else (type(policy),))
     try:

@@ -31,7 +31,7 @@ def expert_of(learner: Learner) -> Expert:
         mean, scale = float(returns.mean()), float(returns.std())
         if scale == 0:
             raise ValueError(
-                f"expert: {settings.expert} needs returns that differ, got {mean:g} in {EPISODES} episodes"
+                f"expert: expected returns that differ for {settings.expert}, got {mean:g} in all {EPISODES} episodes"
             )
     expert = named_expert(settings.expert, mean=mean, scale=scale, seed=settings.seed)
     return NoisyExpert(expert, settings.wrong_answers, settings.seed) if settings.wrong_answers else expert

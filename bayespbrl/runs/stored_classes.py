@@ -85,11 +85,11 @@ def from_tree(tree: xr.DataTree, *, known: Iterable[type] = (), given: Mapping[s
     try:
         return kind(**fields, **arrays, **children, **(given or {}))
     except TypeError as error:
-        raise ValueError(f"stored class: the fields do not fit {kind.__name__} ({error})") from error
+        raise ValueError(f"stored class: expected the fields of {kind.__name__}, got others ({error})") from error
 
 
 def stored_name(kind: type) -> str:
-    """The name of a class in files: that in `STORED`, or the qualified name of a user's class."""
+    """The name of a class in files: its name in `STORED`, or the qualified name of a user's class."""
     return NAMES.get(kind, OWN + kind.__qualname__)
 
 
@@ -99,4 +99,4 @@ def _class_named(name: str, known: tuple[type, ...]) -> type:
             return candidate
     if name in STORED:
         return STORED[name]
-    raise ValueError(f"stored class: expected a class of bayespbrl or one that was passed again, got {name!r}")
+    raise ValueError(f"stored class: expected a class of bayespbrl or one of the objects passed, got {name!r}")

@@ -34,7 +34,7 @@ class UtilityReward(gymnasium.Wrapper):
         estimate = run.estimate
         if estimate is None or estimate.features is None:
             kind = "none yet" if estimate is None else type(estimate).__name__
-            raise ValueError(f"run: expected one with an estimate of the utility, got {kind}")
+            raise ValueError(f"run: expected a run with an estimate of the utility of states, got {kind}")
         given = run.learner.given
         for name in ("observation_space", "action_space"):
             if getattr(env, name) != getattr(given, name):
@@ -42,12 +42,12 @@ class UtilityReward(gymnasium.Wrapper):
         checks.finite("caution", caution)
         self.caution = float(caution)
         if self.caution and estimate.posterior is None:
-            raise ValueError("caution: expected 0 for an estimate without a posterior")
+            raise ValueError(f"caution: expected 0 for an estimate without a posterior, got {self.caution:g}")
         # thinned once: where they are indexed the draws would be, at each step
         self.estimate, self._thinned = estimate, estimate.thinned(DRAWS)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """As of the environment, with the utility as the reward."""
+        """A step of the environment, with the utility as the reward."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         utility, deviation = self._utility(np.asarray(to_plain(self.env.observation_space, observation))[None])
         info = info | {"true_reward": float(reward), "utility_deviation": deviation}

@@ -17,7 +17,7 @@ from bayespbrl.experts import SIMULATED
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR
 
 NAMES = ("default", "paper")
-# The paper's protocol, and the control: a constant bound, one update and one question an iteration.
+# The paper's protocol, and the control: a constant bound, one update and one question per iteration.
 PAPER: dict[str, dict[str, Any]] = {
     "gridworld": {
         "iterations": 25,  # not compared

@@ -38,10 +38,10 @@ class Features:
       utility_bandwidth_factor: multiplies the median rule for the utility's features.
       normalised_utility: whether the utility's radial basis functions are divided by their sum. Decision: they are, so
         that the utility extends to states far from every compared trajectory, where plain ones fall to zero.
-      constant_utility: whether the utility has a constant part, as of `RadialBasisOptions`, where some episodes end
+      constant_utility: whether the utility has a constant part, as in `RadialBasisOptions`, where some episodes end
         before the time limit.
       diffusion_utility: whether the utility of discrete states is smooth over the steps that were observed, with a
-        length scale that is inferred, as of `DiffusionBasis`; else it has an independent value for each state.
+        length scale that is inferred, as in `DiffusionBasis`; else it has an independent value for each state.
     """
 
     features: str = "drawn"
@@ -145,7 +145,7 @@ class Settings:
         if self.iterations is not None:
             checks.whole("iterations", self.iterations)
         elif self.questions.answers is None:
-            raise ValueError("iterations: expected a number without a budget of answers, got None")
+            raise ValueError("iterations: expected a number, because there is no budget of answers, got None")
         checks.one_of("environment", self.environment, ("named", "other"))
         checks.one_of("expert", self.expert, (*SIMULATED, "page", "terminal", "other"))
         checks.share("wrong_answers", self.wrong_answers)
@@ -156,11 +156,12 @@ class Settings:
         utility, query, schedule = self.estimation.utility, self.questions.query, self.update.schedule
         checks.one_of("schedule", schedule, (*SCHEDULES, "other"))
         if utility in WITHOUT_POSTERIOR and query not in ("highest-utility", "other"):
-            raise ValueError(f"query: expected highest-utility with {utility}, no posterior, got {query!r}")
+            raise ValueError(f"query: expected highest-utility with {utility}, which has no posterior, got {query!r}")
         if self.estimation.plain_draws is not None and None in (self.model.steepness, self.model.lapse_rate):
-            raise ValueError("plain_draws: expected a given steepness and lapse_rate, got one that is inferred")
+            given = f"{self.model.steepness} and {self.model.lapse_rate}"
+            raise ValueError(f"plain_draws: expected numbers as steepness and lapse_rate, got {given}")
         if query == "information-when-unsure" and schedule != "confidence":
-            raise ValueError(f"schedule: expected confidence with the query {query}, got {schedule!r}")
+            raise ValueError(f"schedule: expected confidence with the query rule {query}, got {schedule!r}")
         number = self.rollouts.trajectories_per_iteration
         for name, limit in (("queries_per_iteration", number), ("first_queries", number - 1)):
             if (value := getattr(self.questions, name)) > limit:
@@ -190,7 +191,7 @@ class Settings:
 
     @property
     def most_iterations(self) -> int:
-        """The limit that holds: `iterations`, else three for every two answers, and the last ones."""
+        """The limit on iterations: `iterations`, else three for every two answers, plus those of a restarted policy."""
         if self.iterations is not None:
             return self.iterations
         assert self.questions.answers is not None
@@ -214,7 +215,7 @@ class Settings:
         return answers >= budget or unasked >= MOST_UNASKED or iteration >= self.most_iterations - self._restarted
 
     def last_iteration(self, started: int = 0) -> int:
-        """The last iteration that a run can have; `started` as of `finished`."""
+        """The last iteration that a run can have; `started` as in `finished`."""
         return min(self.most_iterations, started + self._restarted) if started else self.most_iterations
 
     def finished(self, iteration: int, answers: int, unasked: int, started: int = 0) -> bool:

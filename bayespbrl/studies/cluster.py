@@ -20,11 +20,13 @@ def scheduler_executor(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise ValueError("scheduler: expected the package distributed: pip install 'bayespbrl[cluster]'") from error
+        raise ValueError(
+            f"scheduler: expected the extra cluster (pip install 'bayespbrl[cluster]'), got {error}"
+        ) from error
     try:
         client = Client(address, timeout=WAIT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"scheduler: expected one at {address!r} that answers within {WAIT} s, got {error}") from error
+        raise ValueError(f"scheduler: expected an answer from {address!r} within {WAIT} s, got {error}") from error
     try:
         # not pure: a trial that is started again is another task; a worker that dies makes the scheduler try anew
         yield client.get_executor(pure=False)

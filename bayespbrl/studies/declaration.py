@@ -121,7 +121,7 @@ def declared(name_or_file: str) -> Declaration:
     try:
         return parsed(file.read_text(), file.stem)
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"study {name_or_file}: cannot be read ({error})") from error
+        raise ValueError(f"study {name_or_file}: expected a readable file, got {error}") from error
 
 
 def parsed(text: str, name: str) -> Declaration:
@@ -147,7 +147,7 @@ def parsed(text: str, name: str) -> Declaration:
         if not any(_matches([level for level, _ in chosen], combination) for combination in left_out)
     )
     if not rows:
-        raise ValueError(f"{where}: expected at least one row, got none: all are left out")
+        raise ValueError(f"{where}: expected at least one row, got none, because all are left out")
     title = content.get("title", name)
     if not isinstance(title, str):
         raise ValueError(f"{where}: expected a title, got {title!r}")

@@ -25,12 +25,12 @@ from bayespbrl.studies.tables import (
     measure_first_policy,
 )
 
-# Trials are redrawn that meet no preference within so many iterations: all trajectories of an early acrobot may time
-# out alike (paper, "Experiments").
+# A trial is redrawn if it meets no preference within this many iterations: an early acrobot's trajectories may all time
+# out (paper, "Experiments").
 PREFERENCE_WITHIN = {"bayespbrl/Acrobot-v0": 3}
 # The most steps of an episode for the balancing time of the final policy, where the task is to stay upright.
 BALANCING_STEPS = {"bayespbrl/Bicycle-v0": 3000}
-MOST_SEEDS_A_TRIAL = 10  # a study gives up after so many seeds per trial: preferences are too rare there
+MOST_SEEDS_A_TRIAL = 10  # a study gives up after this many seeds per trial: preferences are too rare there
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Row:
         return True if measured and kept.finished() else None
 
     def redraws(self, iterations: int, pairs: int) -> bool:
-        """Whether a trial with so many ordered pairs met no preference within the iterations that it has for that."""
+        """Whether a trial is redrawn: it has no ordered pair after the iterations allowed for the first one."""
         return self.preference_within is not None and iterations >= self.preference_within and pairs == 0
 
 
@@ -139,8 +139,8 @@ class Seeds:
         while len(self.outcomes) - len(redrawn := self.with_outcome(False)) < self.trials:
             if len(self.outcomes) >= MOST_SEEDS_A_TRIAL * self.trials:
                 raise ValueError(
-                    f"{len(redrawn)} of {len(self.outcomes)} trials met no preference within "
-                    f"{self.row.preference_within} iterations: expected {self.trials} that do"
+                    f"expected {self.trials} trials with a preference within {self.row.preference_within} iterations, "
+                    f"got none in {len(redrawn)} of {len(self.outcomes)}"
                 )
             seed = self.row.settings.seed + len(self.outcomes)
             self.outcomes[seed] = self.row.outcome(seed)

@@ -190,7 +190,7 @@ def _table_of(levels: tuple[str, ...], seeds: Seeds) -> pd.DataFrame:
 
 
 def _check_same(declaration: Declaration, directory: Path) -> None:
-    """That a directory is new, or holds this study by this version."""
+    """Check that a directory is new, or holds this study by this version."""
     if not directory.exists():
         return
     if not directory.is_dir():
@@ -228,7 +228,7 @@ def read_study_json(directory: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{directory}: expected the directory of a study, got {error}") from error
     if not isinstance(content, dict):
-        raise ValueError(f"{file}: expected the description of a study, got a foreign file")
+        raise ValueError(f"{file}: expected the description of a study, got {str(content)[:60]}")
     return content
 
 

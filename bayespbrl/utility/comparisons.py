@@ -45,7 +45,7 @@ class Comparisons:
           trajectories: by number.
           pairs, ties: of their numbers.
           discount: γ of ψ.
-          sides: of the pairs and then the ties, as of `Source`; where there are any, a side bias is inferred.
+          sides: of the pairs and then the ties, as in `Source`; where there are any, a side bias is inferred.
           answered_by: names, of the pairs and then the ties; each of several has a lapse rate and a side bias.
         """
         every = (*pairs, *ties)
@@ -79,7 +79,7 @@ class Comparisons:
 
 
 def normalised(differences: Float[np.ndarray, "k d"]) -> tuple[Float[np.ndarray, "k d"], float]:
-    """Differences over their root mean square length, and that.
+    """Differences divided by their root mean square length, and that length.
 
     Decision: under w ~ N(0, I) the margins wᵀψ then have the variance 1 in the mean over the answers, whatever the
     features. The answers do not tell the amplitude of the utility. Fixed like this it is the same under all settings of

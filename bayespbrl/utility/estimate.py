@@ -27,7 +27,7 @@ class UtilityEstimate(Protocol):
 
     @property
     def posterior(self) -> DataTree | None:
-        """The draws whose convergence `quality` reports and which all else is of; None for a point estimate."""
+        """The draws from which all else follows, and whose convergence `quality` reports; None for a point estimate."""
         ...
 
     @property
@@ -61,7 +61,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def likelihood(self, number: int | None = None) -> Likelihood:
-        """Of the next answer given its margin under each of S draws, at most `number`: margins have shape (S, n)."""
+        """Likelihood of the next answer given its margin under each of S draws, at most `number`; margins (S, n)."""
         ...
 
     def tie_thresholds(self, number: int | None = None) -> Float[np.ndarray, "s 1"] | None:
@@ -94,7 +94,7 @@ class UtilityEstimate(Protocol):
 
 
 def refused(asked: str, needed: str = "an estimate with a posterior") -> Callable[..., Any]:
-    """The method of that name of an estimate without what it needs: a ValueError."""
+    """A method that raises a ValueError, for an estimate without what the method needs."""
 
     def method(self: object, *arguments: Any, **options: Any) -> NoReturn:
         raise ValueError(f"{asked}: expected {needed}, got {type(self).__name__}")
@@ -119,4 +119,4 @@ class WithoutDraws:
         return self
 
     def hyperparameters(self) -> None:
-        """None: nothing."""
+        """None: nothing is inferred."""

@@ -50,7 +50,7 @@ class Estimation:
         if self.plain_draws is not None:
             checks.whole("plain_draws", self.plain_draws, plain_chain.LEAST)
             if self.hyperparameters != "given":
-                raise ValueError(f"hyperparameters: expected given with plain_draws, got {self.hyperparameters!r}")
+                raise ValueError(f"hyperparameters: expected 'given' with plain_draws, got {self.hyperparameters!r}")
 
 
 def estimate(
@@ -70,7 +70,7 @@ def estimate(
     if options.utility == "known-reward":
         returns = np.array([trajectory.total_reward for trajectory in comparisons.trajectories])
         ordered = [pair for pair, stated in zip(comparisons.pairs, comparisons.ordered, strict=True) if stated]
-        satisfied = sum(bool(returns[i] > returns[j]) for i, j in ordered)
+        satisfied = sum(bool(returns[i] > returns[j]) for i, j in ordered)  # eq. 6
         return KnownReward(FitQuality(True, "known reward", len(ordered), satisfied))
     if options.utility == "linear-program":
         return _by_linear_program(comparisons.feature_sums(features), comparisons, features)
@@ -104,14 +104,14 @@ def infer_utility(
       feature_sums: ψ of n trajectories, or the features of n items of any kind, shape (n, D).
       pairs: ordered pairs (preferred, dominated) of their row numbers.
       ties: pairs that were answered with "no difference". There are K pairs and ties in all.
-      shown_first: as of `sample_posterior`, for the pairs and then the ties: a side bias is inferred.
+      shown_first: as in `sample_posterior`, for the pairs and then the ties: a side bias is inferred.
       answerers: who gave each answer, names or numbers from 0, in the same order: each has a lapse rate and, with
         `shown_first`, a side bias. `posterior["posterior"]["lapse_rate"].sel(answerer="Ada")` are the draws of one.
       features: φ, where utilities of single states are wanted too; None: the rows themselves.
       method: `posterior-mean`; `most-likely`; `posterior-draw`, one draw picked by `seed`, with directions that the
         answers do not touch at their mean, zero; or `linear-program`, which leaves ties out.
       discount: γ of ψ, for trajectories that the estimate is asked about later.
-      prior_scale, steepness, lapse_rate, likelihood, tie_threshold: as of `PreferenceModel`; None: inferred.
+      prior_scale, steepness, lapse_rate, likelihood, tie_threshold: as in `PreferenceModel`; None: inferred.
       seed: of the sampler.
 
     Raises:
@@ -134,11 +134,11 @@ def infer_utility(
 def _by_linear_program(
     feature_sums: np.ndarray, comparisons: Comparisons, features: StateFeatures
 ) -> LinearProgramUtility:
-    """Eq. 10, from ψ of the trajectories, (n, D)."""
+    """The utility by eq. 10, from ψ of the trajectories, (n, D)."""
     checks.finite("feature_sums", feature_sums)
     scaled, scale = normalised(comparisons.differences(feature_sums)[comparisons.ordered])
     program = linear_program(scaled)
-    satisfied = int(np.sum(scaled @ program.weights > 0))
+    satisfied = int(np.sum(scaled @ program.weights > 0))  # eq. 6
     quality = FitQuality(program.converged, program.status, len(scaled), satisfied)
     return LinearProgramUtility(features, program.weights / scale, comparisons.discount, quality, scale)
 
@@ -153,7 +153,7 @@ def _by_posterior(
     seed: int,
     plain: int | None = None,
 ) -> PosteriorUtility:
-    """Eqs. 7-8, from ψ of the trajectories under each setting, (n, D)."""
+    """The utility by eqs. 7-8, from ψ of the trajectories under each setting, (n, D)."""
     for each in feature_sums:
         checks.finite("feature_sums", each)
     scaled = [normalised(comparisons.differences(each)) for each in feature_sums]
@@ -165,12 +165,12 @@ def _by_posterior(
         known = np.where(ordered[:, None], differences, 0.0)
         tree = plain_draws(known, model, draws=plain, seed=seed, number_of_preferences=int(ordered.sum()))
     parts = _parts(tree, method, seed)
-    margins = np.einsum("ckd,cd->k", differences, parts)
+    margins = np.einsum("ckd,cd->k", differences, parts)  # eq. 5
     quality = FitQuality(
         converged=bool(tree.attrs["converged"]),
         status="converged" if tree.attrs["converged"] else "the sampler did not converge within its cap of draws",
         pairs=int(comparisons.ordered.sum()),
-        pairs_satisfied=int(np.sum(margins[comparisons.ordered] > 0)),
+        pairs_satisfied=int(np.sum(margins[comparisons.ordered] > 0)),  # eq. 6
         rhat_max=float(tree.attrs["rhat_max"]),
         effective_sample_size_min=float(tree.attrs["effective_sample_size_min"]),
         log_evidence=float(tree.attrs["log_evidence"]),
@@ -179,7 +179,7 @@ def _by_posterior(
 
 
 def _parts(tree: DataTree, method: str, seed: int) -> np.ndarray:
-    """The weights of each setting, shape (C, D), that stand for a posterior: their functions' sum."""
+    """The weights of each setting, shape (C, D), whose functions add up to the utility that is acted on."""
     if method != "posterior-draw":
         return np.asarray(tree["utility_weights_" + method.removeprefix("posterior-").replace("-", "_")])
     z, numbers = np.asarray(tree["posterior"]["coordinates"]), np.asarray(tree["posterior"]["setting"])

@@ -18,7 +18,7 @@ from bayespbrl.trajectories import Trajectory, trajectory_features
 # The prior: a uniform distribution over these multiples of the bandwidths as given, in each dimension.
 MULTIPLES = (1.0, 3.0, 9.0)
 ROWS_AT_A_TIME = 256  # keeps the factors of all settings in the processor's cache
-MOST_SETTINGS = 27  # beyond three dimensions, so many points of the grid: the equal ones, and others at random
+MOST_SETTINGS = 27  # points of the grid beyond three dimensions: those with equal multiples, and others at random
 
 
 def settings(features: StateFeatures, *, inferred: bool, rng: np.random.Generator) -> Float[np.ndarray, "c s"]:
@@ -74,7 +74,7 @@ def sums_under(
     sums = np.zeros((len(multiples), len(trajectories), functions + bool(features.constant)))
     for i, trajectory in enumerate(trajectories):
         discounts = discount ** np.arange(len(trajectory))
-        sums[:, i, functions:] = features.constant * discounts.sum()
+        sums[:, i, functions:] = features.constant * discounts.sum()  # eq. 1
         for start in range(0, len(trajectory), ROWS_AT_A_TIME):
             rows = slice(start, start + ROWS_AT_A_TIME)
             for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):

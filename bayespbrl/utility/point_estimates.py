@@ -14,7 +14,7 @@ from bayespbrl.utility.quality import FitQuality
 
 @dataclass(frozen=True)
 class LinearProgramUtility(WithoutDraws):
-    """u(s′) = wᵀφ(s′) with the weights of the linear program.
+    """u(s′) = wᵀφ(s′) with the weights of the linear program (eq. 10).
 
     Attributes:
       features: φ.
@@ -40,7 +40,7 @@ class LinearProgramUtility(WithoutDraws):
         return linear(self.features(states), self.weights)
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
-        """uᵢ = wᵀφ(sᵢ′): the utility of the *next* state, the same convention as in ψ."""
+        """uᵢ = wᵀφ(sᵢ′) (paper, step 2): the utility of the *next* state, the same convention as in ψ."""
         return self.utilities(steps.next_states)
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:

@@ -58,10 +58,10 @@ class PosteriorUtility:
         return replace(self, posterior=DataTree.from_dict({"posterior": few}))
 
     def likelihood(self, number: int | None = None) -> Likelihood:
-        """Of the next answer given its margin under each of S draws: margins have shape (S, n).
+        """Likelihood of the next answer given its margin under each of S draws; margins have shape (S, n).
 
         Args:
-          number: as of `trajectory_draws`.
+          number: as in `trajectory_draws`.
         """
         drawn, fitted = self.posterior.children["posterior"].dataset, self.posterior.attrs
         apart = slice(None, None, self._apart(number))
@@ -76,7 +76,7 @@ class PosteriorUtility:
         )
 
     def tie_thresholds(self, number: int | None = None) -> Float[np.ndarray, "s 1"] | None:
-        """The tie threshold of each of S draws, as of `likelihood`; None where no answer was a tie."""
+        """The tie threshold of each of S draws, as in `likelihood`; None where no answer was a tie."""
         drawn = self.posterior.children["posterior"].dataset
         if "tie_threshold" not in drawn:
             return None
@@ -94,11 +94,11 @@ class PosteriorUtility:
     def prior_deviations(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
         """Prior standard deviation of the utility of n states."""
         settings = [self._setting(number)(states) / scale for number, scale in enumerate(self.scales)]
-        variances = [np.sum(features**2, axis=1) for features in settings]
+        variances = [np.sum(features**2, axis=1) for features in settings]  # eq. 7: w ~ N(0, σ²I)
         return float(self.posterior.attrs["prior_scale"]) * np.sqrt(np.mean(variances, axis=0))
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
-        """uᵢ: the utility of the *next* state of each transition, the same convention as in ψ."""
+        """uᵢ = wᵀφ(sᵢ′) (paper, step 2): the utility of the *next* state, the same convention as in ψ."""
         return self.utilities(steps.next_states)
 
     def utilities_and_draws(
@@ -120,10 +120,11 @@ class PosteriorUtility:
     def differences(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, "c n d"]:
         """ψ(first) − ψ of each trajectory under every setting, in the units of the posterior's differences."""
         sums = sums_under(self.features, self.multiples, trajectories, discount=self.discount)
+        # eq. 5
         return np.array([(each[:1] - each[1:]) / scale for each, scale in zip(sums, self.scales, strict=True)])
 
     def hyperparameters(self) -> dict[str, Any]:
-        """Mean and 90 % interval of all that was inferred beside the weights, as plain data.
+        """Mean and 90 % interval of all that was inferred besides the weights, as plain data.
 
         Of several answerers the lapse rate is that of `next_lapse_rates`, and the side bias is the mean.
         """

@@ -182,7 +182,7 @@ def _with_iteration(contents: RunContents, iteration: int, file: Path, features:
 def _fitting_parts(
     contents: RunContents, file: Path, names: tuple[str, ...], features: StateFeatures | None
 ) -> dict[str, Any]:
-    """Parts of an iteration's file, where they fit the run; `ValueError` with the file's name else."""
+    """Parts of an iteration's file, where they fit the run; `ValueError` with the file's name otherwise."""
     parts = read_parts(file, names, features=features)
     try:
         _check_fitting(contents, parts, features)
@@ -192,7 +192,7 @@ def _fitting_parts(
 
 
 def _check_fitting(contents: RunContents, parts: Mapping[str, Any], features: StateFeatures | None) -> None:
-    """That trajectories are of the run's environment, and that the estimate is one of such trajectories.
+    """Check that trajectories are of the run's environment, and that the estimate applies to them.
 
     Raises:
       ValueError: they are not; the file may be a stranger's, or damaged.
@@ -200,7 +200,7 @@ def _check_fitting(contents: RunContents, parts: Mapping[str, Any], features: St
     trajectories = parts["trajectories"]
     number = contents.settings.rollouts.trajectories_per_iteration
     if len(trajectories) != number:
-        raise ValueError(f"{number} trajectories were expected, and {len(trajectories)} are there")
+        raise ValueError(f"expected {number} trajectories, got {len(trajectories)}")
     if contents.environment is not None:
         for trajectory in trajectories:
             check_of_space("states", trajectory.states, contents.environment.observation_space)
@@ -214,7 +214,9 @@ def _check_fitting(contents: RunContents, parts: Mapping[str, Any], features: St
         if estimate.posterior is not None:
             estimate.trajectory_draws(trajectories[:1], number=2)
     except Exception as error:  # of damaged arrays, anything
-        raise ValueError(f"the estimate fails ({type(error).__name__}: {' '.join(str(error).split())})") from error
+        raise ValueError(
+            f"expected an estimate that fits, got {type(error).__name__}: {' '.join(str(error).split())}"
+        ) from error
 
 
 def _features_failure(estimate: UtilityEstimate, features: StateFeatures | None, trajectory: Trajectory) -> str:
@@ -248,9 +250,11 @@ def _with_environment(contents: RunContents, env: gymnasium.Env | FuncEnv | None
     settings = contents.settings
     try:
         if env is None and settings.environment == "other":
-            raise ValueError(f"{settings.env} is an object of your own: pass it to bayespbrl.load as env=")
+            raise ValueError(f"expected your own environment {settings.env} as env= of bayespbrl.load, got none")
         if env is None and not import_package and (package := imported_by_name(settings.env)):
-            raise ValueError(f"it needs the package {package!r}, imported only with import_package or --import-package")
+            raise ValueError(
+                f"expected permission to import {package!r} (import_package or --import-package), got none"
+            )
         return replace(contents, environment=open_environment(settings.env if env is None else env))
     except ValueError as error:
         what = f"The environment cannot be opened ({error}). What needs it is missing here."

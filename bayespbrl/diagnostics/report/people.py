@@ -85,10 +85,10 @@ def _of_one(one: xr.Dataset, *, several: bool) -> Iterator[ReportWarning]:
     rate, lower, upper = (float(one[f"lapse_rate{end}"]) for end in ("", "_lower", "_upper"))
     if lower > LITTLE_WORTH:
         what = f"{who}: {percent(rate)} of the answers look like coin tosses ({percent(lower)} to {percent(upper)})."
-        yield ReportWarning(what, f"Drop them. {others}" if several else "Ask someone else, and start anew.")
+        yield ReportWarning(what, f"Drop them. {others}" if several else "Start a new run with someone else.")
     elif lower > LESS_TRUST:
         what = f"{who}: {percent(rate)} of the answers look like coin tosses ({percent(lower)} to {percent(upper)})."
-        yield ReportWarning(what, "Trust them less: the posterior already does. Ask more questions to make up for it.")
+        yield ReportWarning(what, "The posterior already trusts them less. Ask more questions to make up for it.")
     repeated, consistent = int(one["repeated"]), int(one["consistent"])
     if float(one["consistency_upper"]) < RARELY_CONSISTENT:
         what = f"{who}: only {consistent} of {count(repeated, 'repeated question')} were answered as before."

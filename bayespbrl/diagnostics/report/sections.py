@@ -62,7 +62,7 @@ def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
         )
         if contents.started:
             caption += (
-                " It begins again where a policy was started anew; the last iteration is of that policy, kept or not."
+                " It begins again where the policy was restarted; the last iteration is of that policy, kept or not."
             )
         alt = "The inferred utility of each iteration's trajectories."
         blocks.append(drawn("progress", curve, caption, alt, size=(7.6, 3.0)))
@@ -78,13 +78,13 @@ def convergence_of_fits(contents: RunContents, iterations: xr.Dataset) -> Body:
         ("Effective sample size", partial(figures.plot_effective_sample_size, iterations)),
     ]
     caption = (
-        "The worst margin of each fit. R̂ should be below its limit and the effective sample size above its limit. "
+        "The worst margin of each fit. R̂ should stay below its limit, and the effective sample size above its limit. "
         "Crosses mark fits that did not converge within their cap of draws."
     )
     every = drawn("convergence", panels, caption, "R̂ and effective sample size by iteration.")
     result = convergence(contents.posterior)
     if not result.sizes["preference"]:
-        return ["The last fit has no preference, and so nothing to converge."], [every]
+        return ["The last fit has no preferences, so there is nothing to diagnose."], [every]
     margins = drawn(
         "margins",
         [(f"The fit of iteration {contents.estimate_iteration}", partial(plot_convergence, result))],
@@ -177,7 +177,7 @@ def updates(iterations: xr.Dataset) -> Body:
     blocks: list[Block] = [drawn("updates", panels, caption, "KL, temperature, entropy and effective samples.")]
     for group, label in (
         ("schedule", "Schedule of the KL bound"),
-        ("hyperparameters", "What was inferred beside the weights"),
+        ("hyperparameters", "What was inferred besides the weights"),
     ):
         blocks += _reported(iterations, group, label)
     return [], blocks

@@ -57,7 +57,7 @@ def _restart(contents: RunContents) -> Iterator[str]:
     if contents.started and isinstance(kept, int):
         of = "the one" if kept > contents.started else "the earlier one"
         yield (
-            f"After iteration {contents.started} a policy was started anew with the last posterior; the run keeps {of} "
+            f"After iteration {contents.started} the policy was restarted with the last posterior; the run keeps {of} "
             f"of iteration {kept}."
         )
 
@@ -69,7 +69,7 @@ def _convergence(contents: RunContents) -> str:
     if contents.estimate_iteration < len(contents.iterations):
         return (
             f"The newest utility estimate that can be read is that of iteration {contents.estimate_iteration}; what "
-            "follows about the utility is as of that iteration."
+            "follows about the utility describes that iteration."
         )
     if contents.posterior is None:
         return (

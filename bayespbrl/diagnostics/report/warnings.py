@@ -48,7 +48,7 @@ def _of_fits(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarning
             f"The posterior did not converge in {_which(failed)}. {last}Uncertainties there are unreliable, and so are "
             "the policy updates that followed.",
             "Look at the rank plots. The usual reason is answers that contradict each other, under a lapse rate that "
-            "was set to zero: leave it to be inferred.",
+            "was set to zero. Let it be inferred.",
         )
 
 
@@ -57,7 +57,7 @@ def _of_updates(table: xr.Dataset) -> Iterator[ReportWarning]:
     if failed.any():
         yield ReportWarning(
             f"REPS did not converge in {_which(iteration[failed])}: the policy was left unchanged.",
-            "Fewer centres (--centres) or a smaller --kl-bound make the dual easier to solve.",
+            "Fewer centres (--centres) or a smaller --kl-bound makes the dual easier to solve.",
         )
     if (idle := iteration[(table["bound_active"].values == 0) & ~failed]).size:
         yield ReportWarning(
@@ -97,8 +97,8 @@ def _of_entropy(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarn
     if collapsed:
         yield ReportWarning(
             f"The policy's entropy collapsed, from {first:.2f} to {last:.2f} nats: it hardly explores.",
-            "Right if the value is good. Otherwise the policy settled too early: a smaller --kl-bound narrows it more "
-            "slowly. Another --seed shows whether that was chance.",
+            "Harmless if the value is good. Otherwise the policy settled too early: a smaller --kl-bound narrows it "
+            "more slowly. A run with another --seed shows whether this was chance.",
         )
 
 
@@ -132,7 +132,7 @@ def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWa
     if ties > 0.3 * max(3, len(contents.answers)):
         yield ReportWarning(
             f"{ties} of {len(contents.answers)} answers were ties, from which the posterior learns little.",
-            "Longer or more different trajectories are easier to tell apart.",
+            "Longer trajectories, or less similar ones, are easier to tell apart.",
         )
 
 

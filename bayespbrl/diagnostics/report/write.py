@@ -55,7 +55,7 @@ def write_report(
             _write_pictures(Path(directory) / "report_files", report)
         write_file(path, _rendered(report, format))
     except OSError as error:
-        raise ValueError(f"{path}: cannot write the report there ({error})") from error
+        raise ValueError(f"{path}: expected a place where the report can be written, got {error}") from error
     return path
 
 
