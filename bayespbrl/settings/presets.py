@@ -104,7 +104,6 @@ DEFAULT: dict[str, Any] = {
     "checked": True,  # without it the last policy of Pendulum was far below its best
     "restart_iterations": 8,  # what the first policy misses, one that begins with the last posterior often finds
     "constant_utility": True,  # CartPole's answers are foreseen better
-    "diffusion_utility": True,  # Gridworld's answers are foreseen as often as it says
     "critic_iterations": 4,  # on the hidden reward Pendulum forgets with all transitions
     "recent_iterations": 4,  # not compared
     "update_states": 10_000,  # not compared
@@ -173,8 +172,6 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     options = DEFAULT | ({} if task is None else task.derived(people=people)) | TASKS.get(name, {})
     if people:
         options |= PEOPLE
-    if chosen.get("utility") in WITHOUT_POSTERIOR:
-        options["diffusion_utility"] = False  # its length scale would not be inferred
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":
         options["query"] = "highest-utility"
     return options
