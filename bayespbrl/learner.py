@@ -197,11 +197,12 @@ class Learner:
           ValueError: an answer that is none, not as many answers as questions, or a bad name or time; nothing has
             happened then.
         """
-        self._take_in(answers, answerer, seconds)
+        self._take_in(self._waiting(), answers, answerer, seconds)
         self._advance()
 
-    def _take_in(self, answers: Sequence[Answer | str], answerer: str | None, seconds: float | None) -> None:
-        waiting = self._waiting()
+    def _take_in(
+        self, waiting: Sequence[Query], answers: Sequence[Answer | str], answerer: str | None, seconds: float | None
+    ) -> None:
         if isinstance(answers, str) or not isinstance(answers, Sequence) or len(answers) != len(waiting):
             raise ValueError(f"tell: expected a list of {len(waiting)} answers, one to each question, got {answers!r}")
         parsed = [parse_answer(answer) for answer in answers]
@@ -242,21 +243,38 @@ class Learner:
 
         Args:
           expert: called with the two trajectories in the order shown.
-          answerer: the name of a person who answers; how long each answer took is then kept too.
+          answerer: the name of a person who answers; how long each answer took is then kept too. A repeated question
+            that waits for another person is left open.
           progress: called after each iteration, those that ask nothing among them.
         """
         if not callable(expert):
             raise ValueError(f"expert: expected a function of two trajectories, got {expert!r}")
         self._advance(progress)
-        while questions := self._waiting():
+        while (query := self._question_for(answerer, progress)) is not None:
             began = time.perf_counter()
-            answers = [parse_answer(expert(*query.trajectories)) for query in questions]
+            answer = parse_answer(expert(*query.trajectories))
             seconds = None if answerer is None else time.perf_counter() - began
-            if answers == [Answer.UNDO] and self.state.previous is None:
+            if answer is Answer.UNDO and self.state.previous is None:
                 continue  # nothing to take back: the same question again
-            self._take_in(answers, answerer, seconds)
+            self._take_in([query], [answer], answerer, seconds)
             self._advance(progress)
         return self
+
+    def _question_for(self, answerer: str | None, progress: Callable[["Learner"], None] | None) -> Query | None:
+        """The question for a person, asked if need be; None when finished.
+
+        A repeated question is for whoever answered it before, unless the person has no name.
+        """
+        while not self.finished:
+            by = {past.number: past.answerer for past in self.state.past}
+            for query in self.state.open:
+                if answerer is None or query.repeats is None or by[query.repeats] == answerer:
+                    return query
+            entry = self.cycle.next(self.state, answerer, others=0)  # past the questions of others
+            if entry is None:
+                return None
+            self._append(entry, progress)
+        return None
 
     def widget(
         self, *, answers: int | None = None, answerer: str | None = None, practice: bool = True
@@ -290,9 +308,12 @@ class Learner:
     def _advance(self, progress: Callable[["Learner"], None] | None = None) -> None:
         """Do what can be done without an answer; `progress` is called after each iteration."""
         while (entry := self.cycle.next(self.state)) is not None:
-            self.record(entry)
-            if progress is not None and entry.event["event"] == "improved":
-                progress(self)
+            self._append(entry, progress)
+
+    def _append(self, entry: Entry, progress: Callable[["Learner"], None] | None) -> None:
+        self.record(entry)
+        if progress is not None and entry.event["event"] == "improved":
+            progress(self)
 
     def record(self, entry: Entry) -> None:
         """Append an event to the log first, then move on: what the learner knows is never ahead of what is kept.

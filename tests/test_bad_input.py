@@ -130,7 +130,7 @@ def test_features_of_the_wrong_shape_or_kind(tmp_path, straight, calls_an_iterat
 
 def test_features_that_are_suddenly_more(tmp_path, straight, calls_an_iteration):
     more = Faulty(features, lambda states: np.hstack([states, features(states)]), calls_an_iteration)
-    stopped(tmp_path / "run", "features: expected 4 of each state, as before, got 6", features=more)
+    stopped(tmp_path / "run", "features: expected 4 for each state, as before, got 6", features=more)
     goes_on(tmp_path / "run", 1, straight)
 
 

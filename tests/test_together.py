@@ -270,6 +270,18 @@ def test_a_run_ends_though_a_repeat_waits_for_somebody_who_has_left(repeat_waits
     assert bayespbrl.load(directory).learner.finished
 
 
+def test_a_person_at_the_terminal_is_not_asked_a_repeat_that_waits_for_another(repeat_waits):
+    directory, number = repeat_waits
+    shutil.copytree(directory, directory.parent / "again")
+    bob = bayespbrl.resume(directory).run(lambda first, second: "first", answerer="Bob")
+    assert bob.finished
+    assert [query.number for query in bob.state.open] == [number]
+    assert {past.answerer for past in bob.state.past if past.number > number} == {"Bob"}
+    ada = bayespbrl.resume(directory.parent / "again").run(lambda first, second: "first", answerer="Ada")
+    assert {past.answerer for past in ada.state.past if past.number >= number} == {"Ada"}
+    assert fingerprint(bayespbrl.load(directory).learner) == fingerprint(bob)
+
+
 def test_whoever_gives_no_name_is_shown_the_question_that_waits(repeat_waits):
     directory, number = repeat_waits
     assert alone(directory, None, answers=1)[0] == [number]
