@@ -261,14 +261,10 @@ class Learner:
         return self
 
     def _question_for(self, answerer: str | None, progress: Callable[["Learner"], None] | None) -> Query | None:
-        """The question for a person, asked if need be; None when finished.
-
-        A repeated question is for whoever answered it before, unless the person has no name.
-        """
+        """The question for a person, asked if need be; None when finished."""
         while not self.finished:
-            by = {past.number: past.answerer for past in self.state.past}
             for query in self.state.open:
-                if answerer is None or query.repeats is None or by[query.repeats] == answerer:
+                if self.state.may_answer(query, answerer):
                     return query
             entry = self.cycle.next(self.state, answerer, others=0)  # past the questions of others
             if entry is None:

@@ -30,9 +30,9 @@ from bayespbrl.results.write import section, tables_of
 from bayespbrl.runs.directory import read_summary
 from bayespbrl.studies.baseline_trials import read_baseline
 from bayespbrl.studies.declaration import declared
+from bayespbrl.studies.machine import rounding
 from bayespbrl.studies.processes import trial_processes
 from bayespbrl.studies.rows import row_of, run_trial
-from bayespbrl.studies.study import rounding
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "RESULTS.md"

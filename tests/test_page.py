@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from toys import QUICK, READY, Slope, fingerprint
+from toys import INTERRUPTIBLE, QUICK, READY, Slope, fingerprint
 
 import bayespbrl
 from bayespbrl.people.clips import MOST_BYTES
@@ -556,10 +556,7 @@ class Person:
 def test_ctrl_c_ends_a_sitting_with_its_status_and_the_same_command_goes_on(tmp_path):
     bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
     person = Person(tmp_path / "run")
-    # where the tests run in the background interrupts are ignored, and would be here
-    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    program = f"{heard}; from bayespbrl.cli.commands import main; main()"
-    command = [sys.executable, "-c", program, "ask", str(tmp_path / "run"), "--no-practice"]
+    command = [*INTERRUPTIBLE, "ask", str(tmp_path / "run"), "--no-practice"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         try:
             lines = iter(server.stdout.readline, "")

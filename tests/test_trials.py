@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from concurrent.futures import Future
 from pathlib import Path
@@ -17,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from toys import SHORT
+from toys import INTERRUPTIBLE, SHORT
 
 from bayespbrl import ReturnExpert, load, runs, start
 from bayespbrl.rollouts import returns
@@ -295,9 +294,7 @@ def test_bad_input_is_named_and_nothing_is_left(tmp_path, changes):
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["killed", "interrupted"])
 def test_a_study_that_is_stopped_takes_its_trials_with_it(tmp_path, how):
-    # where the tests run in the background interrupts are ignored, and would be here
-    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-c", f"{heard}; from bayespbrl.cli.commands import main; main()", "trials", "gridworld"]
+    command = [*INTERRUPTIBLE, "trials", "gridworld"]
     options = [
         "--preset",
         "paper",

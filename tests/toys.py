@@ -1,5 +1,7 @@
 """Toy environments, runs that take a second, and the comparison of two learners bit for bit."""
 
+import sys
+
 import gymnasium
 import jax
 import numpy as np
@@ -8,6 +10,10 @@ from gymnasium.spaces import Box
 # The paper's protocol with short episodes, and a run of it that takes a second.
 SHORT = {"preset": "paper", "max_steps": 20, "evaluation_episodes": 3}
 QUICK = SHORT | {"utility": "linear-program", "iterations": 3, "seed": 7}
+
+# The command line in a process that hears interrupts: where tests run in the background they are ignored.
+HEARS_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+INTERRUPTIBLE = [sys.executable, "-c", f"{HEARS_INTERRUPTS}; from bayespbrl.cli.commands import main; main()"]
 
 # Selects the page or the widget while it waits for an answer.
 READY = ".bp-box[data-phase=question][data-locked=false]"

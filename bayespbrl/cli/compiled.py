@@ -8,6 +8,8 @@ from pathlib import Path
 
 import jax
 
+from bayespbrl.studies.machine import processor_lines
+
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"  # JAX's own; it holds where it is set
 HARMLESS = tuple(f"Error {doing} persistent compilation cache entry" for doing in ("reading", "writing"))
 
@@ -34,9 +36,5 @@ def keep_compiled() -> None:
 
 def _processor() -> str:
     """The kind of processor, with its instruction set where the system reports one."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    known = sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
+    known = sorted({line for line in processor_lines() if line.startswith(("flags", "Features", "model name"))})
     return hashlib.sha256("\n".join([platform.machine(), *known]).encode()).hexdigest()[:16]

@@ -102,6 +102,15 @@ class LearnerState:
         """Whether the next trajectories follow the first policy again."""
         return self.restart is None and settings.restarts(self.iteration, self.preferences.answers, self.unasked)
 
+    def may_answer(self, query: Query, person: str | None) -> bool:
+        """Whether a person, None without a name, may answer: a repeat is for whoever answered the question before.
+
+        Someone without a name may answer each.
+        """
+        if query.repeats is None or person is None:
+            return True
+        return any(past.number == query.repeats and past.answerer == person for past in self.past)
+
     @property
     def started(self) -> int:
         """Iterations completed when the present policy was started."""

@@ -146,16 +146,14 @@ class Foresight:
     def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
         """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.
 
-        A repeated question is left to whoever answered the first one, unless one person without a name answers.
+        A repeated question is left to those who may answer it.
         """
         if state.finished(self.cycle.settings):
             return {}
         waiting = {query.number: query for query in state.open}
         holders = {number: who for number, who in before.items() if number in waiting and who in self.people}
         for query in sorted(state.open, key=lambda query: query.answerer not in self.people):
-            free = [name for name in self.people if name not in holders.values()]
-            if query.repeats is not None and self.people != (None,):
-                free = [past.answerer for past in state.past if past.number == query.repeats and past.answerer in free]
+            free = [who for who in self.people if who not in holders.values() and state.may_answer(query, who)]
             if free and query.number not in holders:
                 holders[query.number] = query.answerer if query.answerer in free else free[0]
         return holders

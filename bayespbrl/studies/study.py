@@ -1,20 +1,17 @@
 """A declared study on disk: a run directory for each cell, a copy of the declaration, one table.
 
 study.toml          the declaration
-study.json          study, version, command, machine, date
+study.json          study, version, command, machine, rounding, date
 iterations.csv      a line for each trial and iteration of the finished trials
 TASK/METHOD/…/seed-1000/   the run directories
 """
 
 import json
-import os
-import platform
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
@@ -26,6 +23,7 @@ from bayespbrl import checks
 from bayespbrl.runs.files import write_file
 from bayespbrl.studies.declaration import AXES, Declaration, parsed
 from bayespbrl.studies.engine import Engine, Failure, Progress
+from bayespbrl.studies.machine import machine, rounding, source_digest
 from bayespbrl.studies.rows import Seeds, collected, row_of, seconds_of
 from bayespbrl.studies.trials import executor_for
 
@@ -230,35 +228,3 @@ def read_study_json(directory: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{file}: expected the description of a study, got {str(content)[:60]}")
     return content
-
-
-def machine() -> str:
-    """The machine in words: processor, cores, Python and JAX."""
-    processor = platform.processor() or platform.machine()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{processor}, {cores} cores, Python {platform.python_version()}, jax {version('jax')}"
-
-
-def rounding() -> dict[str, str]:
-    """What decides how sums are rounded: the processor, and the versions of the numerical libraries.
-
-    Where all is the same a trial gives the same numbers; elsewhere its first iterations do, until rounding shows.
-    """
-    try:
-        lines = [line.partition(":") for line in Path("/proc/cpuinfo").read_text().splitlines()]
-    except OSError:
-        lines = []
-    known = {name.strip(): text.strip() for name, _, text in lines}
-    names = ("vendor_id", "cpu family", "model", "CPU implementer", "CPU part")  # two vocabularies: x86 and ARM
-    kind = [platform.machine(), *(f"{name} {known[name]}" for name in names if name in known)]
-    kind += sorted({"avx2", "avx512f"} & set(known.get("flags", "").split()))
-    return {"processor": ", ".join(kind)} | {name: version(name) for name in ("casadi", "jaxlib", "numpy", "scipy")}
-
-
-def source_digest() -> str:
-    """The first ten digits of the SHA-256 digest of the package's Python files: which source a study ran with."""
-    digest = sha256()
-    root = Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:10]
