@@ -29,6 +29,7 @@ def has_shape(hint):
 # Calls of each function that are checked in each test: a sampler's or a fit's inner loop makes thousands alike.
 CHECKED_CALLS = 20
 calls = Counter()
+jaxtyped = jaxtyping.jaxtyped
 
 
 def check_shapes(function):
@@ -38,16 +39,30 @@ def check_shapes(function):
     """
     hints = function.__annotations__
     function.__annotations__ = {name: hint for name, hint in hints.items() if has_shape(hint)}
-    if not function.__annotations__:
-        return function
-    checked = beartype(conf=BeartypeConf(is_pep484_tower=True))(function)  # an int may stand for a float
+    return beartype(conf=BeartypeConf(is_pep484_tower=True))(function)  # an int may stand for a float
 
-    @functools.wraps(function)
-    def first_calls(*arguments, **options):
-        calls[function] += 1
-        return (checked if calls[function] <= CHECKED_CALLS else function)(*arguments, **options)
 
-    return first_calls
+def first_calls_checked(*, typechecker):
+    """What the hook decorates with instead of `jaxtyped`: the shapes of the first calls of each function are checked.
+
+    Otherwise a tenth of the time would go to binding the arguments of all the others.
+    """
+
+    def decorate(function):
+        checked = jaxtyped(function, typechecker=typechecker)
+        if isinstance(function, type):
+            return checked
+        if not any(map(has_shape, function.__annotations__.values())):
+            return function
+
+        @functools.wraps(function)
+        def first_calls(*arguments, **options):
+            calls[function] += 1
+            return (checked if calls[function] <= CHECKED_CALLS else function)(*arguments, **options)
+
+        return first_calls
+
+    return decorate
 
 
 def pytest_runtest_setup():
@@ -70,6 +85,7 @@ def pytest_sessionstart(session):
     if session.config.getoption("dist", "no") == "no":  # not where tests are only handed out to other processes
         for name in LIBRARIES:
             importlib.import_module(name)
+        jaxtyping.jaxtyped = first_calls_checked
         jaxtyping.install_import_hook(CHECKED, "conftest.check_shapes")
 
 
