@@ -5,9 +5,9 @@ BIN := $(VENV)/bin
 
 # One test process a core and one more, because some wait for browsers, kernels and servers; at most eight. Each holds up to
 # 1.5 GiB; a process that is done takes tests from another. Of pytest's installed plugins only xdist is loaded: importing the
-# others takes each process seconds.
+# others takes each process seconds, and so does compiling modules again where the environment keeps none.
 WORKERS := $(shell $(PYTHON) -c 'import os; print(min(8, 1 + (os.cpu_count() or 1)))')
-PYTEST := PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -p xdist -q -n $(WORKERS) --dist worksteal
+PYTEST := PYTHONDONTWRITEBYTECODE= PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -p xdist -q -n $(WORKERS) --dist worksteal
 
 .PHONY: run test check fast results results-check neighbours
 .DEFAULT_GOAL := run
