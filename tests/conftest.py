@@ -49,11 +49,11 @@ def first_calls_checked(*, typechecker):
     """
 
     def decorate(function):
-        checked = jaxtyped(function, typechecker=typechecker)
         if isinstance(function, type):
-            return checked
-        if not any(map(has_shape, function.__annotations__.values())):
+            return jaxtyped(function, typechecker=typechecker)
+        if not any(isinstance(hint, str) or has_shape(hint) for hint in function.__annotations__.values()):
             return function
+        checked = jaxtyped(function, typechecker=typechecker)  # which reads what stands in quotes
 
         @functools.wraps(function)
         def first_calls(*arguments, **options):
