@@ -5,7 +5,7 @@
 Each run draws a utility w ~ N(0, I) over items with five features, scaled so that margins have the prior standard
 deviation 1. Two people answer forty random questions in turn. Both are Bradley-Terry answerers of steepness 5 who call
 margins "no difference" by a threshold of one third, and favour the side shown first by 0.5 nats. One never lapses; 40 %
-of the other's answers are coin tosses, with each stated order equally probable. The model infers all of it. It is
+of the other's answers are given at random, each of the three equally probable. The model infers all of it. It is
 compared with the same model without these parts: no ties, no side bias, and one lapse rate, which is inferred too.
 
 With `--drawn`, steepness, threshold, biases and lapse rates of each run are drawn from the priors of the model. Then
@@ -74,12 +74,12 @@ class People:
 
     def answers(self, rng: np.random.Generator, margins: np.ndarray, who: np.ndarray) -> np.ndarray:
         """1 the first shown, −1 the second, 0 no difference."""
-        lapsed, tossed, drawn = rng.random((3, len(margins)))
+        lapsed, at_random, drawn = rng.random((3, len(margins)))
         margins = margins + np.array(self.biases)[who]
         # Bradley & Terry (1952), with the threshold of Rao & Kupper (1967)
         first, second = (expit(self.steepness * (side * margins - self.threshold)) for side in (1, -1))
         answer = np.where(drawn < first, 1, np.where(drawn < first + second, -1, 0))
-        return np.where(lapsed < np.array(self.lapse_rates)[who], np.where(tossed < 0.5, 1, -1), answer)
+        return np.where(lapsed < np.array(self.lapse_rates)[who], np.floor(3 * at_random).astype(int) - 1, answer)
 
 
 @dataclass(frozen=True)

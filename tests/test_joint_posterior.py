@@ -36,12 +36,12 @@ def log_probability(t, *, m, lapse, number, threshold=None, tied=False):
     """Eq. 8 with lapses and ties, written anew."""
 
     def ordered(t):
-        return lapse / 2 + (1 - lapse) * ((number - 1) * (t > 0) + expit(m * t)) / number
+        return ((number - 1) * (t > 0) + expit(m * t)) / number
 
     if threshold is None:
-        return np.log(ordered(t))
+        return np.log(lapse / 2 + (1 - lapse) * ordered(t))
     p = ordered(t + threshold) - ordered(t - threshold) if tied else ordered(t - threshold)
-    return np.log(np.maximum(p, 1e-300))
+    return np.log(np.maximum(lapse / 3 + (1 - lapse) * p, 1e-300))
 
 
 def quadrature(settings, *, tied=None, lapses=priors.LAPSE_RATE, sides=None, answerers=None):

@@ -12,7 +12,9 @@ from bayespbrl.models.likelihoods import (
     WithLapses,
     WithTies,
     log_prob,
+    ties_of,
     total_log_prob,
+    with_threshold,
 )
 from bayespbrl.models.priors import LAPSE_RATE, STEEPNESS, TIE_THRESHOLD
 
@@ -57,6 +59,17 @@ def test_lapses_are_a_share_of_coin_tosses():
     np.testing.assert_allclose(probability(WithLapses(base, 0.4)), 0.2 + 0.6 * probability(base), rtol=1e-13)
 
 
+@pytest.mark.parametrize("tied", [False, True])
+def test_where_ties_are_possible_a_lapse_is_one_of_three_answers(tied):
+    answers = WithTies(Mixed(5.0, 7.0), 0.3, np.full(len(MARGINS), tied))
+    np.testing.assert_allclose(probability(WithLapses(answers, 0.3)), 0.1 + 0.7 * probability(answers), rtol=1e-13)
+
+
+def test_a_tie_far_from_a_tie_is_a_lapse():
+    tie = WithLapses(WithTies(Logistic(50.0), 0.1, np.array([True])), 0.3)
+    np.testing.assert_allclose(log_prob(tie, np.array([1e3])), np.log(0.1), rtol=1e-12)
+
+
 @pytest.mark.parametrize("likelihood", ALL)
 def test_both_answers_sum_to_one_and_a_zero_margin_is_a_coin_toss(likelihood):
     np.testing.assert_allclose(probability(likelihood) + probability(likelihood, -MARGINS), 1, rtol=1e-12)
@@ -65,8 +78,8 @@ def test_both_answers_sum_to_one_and_a_zero_margin_is_a_coin_toss(likelihood):
 
 @pytest.mark.parametrize("likelihood", ALL)
 def test_two_orders_and_a_tie_sum_to_one(likelihood):
-    ordered = WithTies(likelihood, 0.3, np.zeros(len(MARGINS), dtype=bool))
-    tie = WithTies(likelihood, 0.3, np.ones(len(MARGINS), dtype=bool))
+    ordered = with_threshold(likelihood, 0.3, np.zeros(len(MARGINS), dtype=bool))
+    tie = with_threshold(likelihood, 0.3, np.ones(len(MARGINS), dtype=bool))
     np.testing.assert_allclose(probability(ordered) + probability(ordered, -MARGINS) + probability(tie), 1, rtol=1e-11)
 
 
@@ -75,7 +88,10 @@ def test_ties_vanish_as_the_threshold_does():
     np.testing.assert_allclose(probability(WithTies(likelihood, 1e-12, none)), probability(likelihood), rtol=1e-9)
 
 
-@pytest.mark.parametrize("likelihood", [*ALL, WithTies(Logistic(4.0), 0.2, np.arange(len(MARGINS)) % 2 == 0)])
+SOME_TIES = WithTies(Logistic(4.0), 0.2, np.arange(len(MARGINS)) % 2 == 0)
+
+
+@pytest.mark.parametrize("likelihood", [*ALL, SOME_TIES, WithLapses(SOME_TIES, 0.3)])
 def test_the_mixture_of_probits_is_the_likelihood(likelihood):
     constant, weights, offsets, scales = likelihood.probit_mixture()
     away = np.where(MARGINS[:, None] > offsets, np.inf, np.where(MARGINS[:, None] < offsets, -np.inf, 0.0))
@@ -122,12 +138,14 @@ def test_a_preference_model_names_its_likelihood():
     assert PreferenceModel(likelihood="logistic").answer_likelihood(2) == Logistic(5.0)
     lapsing = PreferenceModel(likelihood="probit", lapse_rate=0.1, tie_threshold=0.2)
     with_ties = lapsing.answer_likelihood(2, tied)
-    assert (with_ties.ordered, with_ties.threshold) == (WithLapses(Probit(5.0), 0.1), 0.2)
-    np.testing.assert_array_equal(with_ties.indifferent, tied)
-    np.testing.assert_array_equal(lapsing.answer_likelihood(3).indifferent, np.zeros(3, dtype=bool))
+    ties = ties_of(with_ties)
+    assert (with_ties.lapse_rate, ties.ordered, ties.threshold) == (0.1, Probit(5.0), 0.2)
+    np.testing.assert_array_equal(ties.indifferent, tied)
+    np.testing.assert_array_equal(ties_of(lapsing.answer_likelihood(3)).indifferent, np.zeros(3, dtype=bool))
+    assert ties_of(PreferenceModel(lapse_rate=0.1).answer_likelihood(2)) is None
     # what is not given is at its prior's mean
     inferred = PreferenceModel(steepness=None, lapse_rate=None).answer_likelihood(2, tied)
-    assert inferred.threshold == pytest.approx(TIE_THRESHOLD.mean)
-    assert (inferred.ordered.attentive.steepness, inferred.ordered.lapse_rate) == (STEEPNESS.mean, LAPSE_RATE.mean)
+    assert ties_of(inferred).threshold == pytest.approx(TIE_THRESHOLD.mean)
+    assert (ties_of(inferred).ordered.steepness, inferred.lapse_rate) == (STEEPNESS.mean, LAPSE_RATE.mean)
     with pytest.raises(ValueError, match=r"indifferent: expected bool of shape \(K,\)"):
         lapsing.answer_likelihood(2, np.zeros(2))

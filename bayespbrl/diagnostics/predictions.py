@@ -61,11 +61,10 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: An
         spread = model.prior_scale * np.linalg.norm(rows - inside @ basis.T, axis=1)
         values = {name: draws[name][chosen] for name in PARAMETERS if name in draws}
         values = {name: value if value.ndim == 2 else value[:, None] for name, value in values.items()}
-        threshold = values.pop("tie_threshold", np.zeros((1, 1)))
-        likelihood = likelihood_of(model.likelihood, number_of_preferences(tree), **values)
-        # p(t − δ) and p(−t − δ) of Rao & Kupper (1967)
+        stated = np.zeros(len(spread), dtype=bool)
+        likelihood = likelihood_of(model.likelihood, number_of_preferences(tree), indifferent=stated, **values)
         for column, side in ((PREFERRED, 1.0), (DOMINATED, -1.0)):
-            probabilities[:, column] += smoothed_probability(likelihood, side * margins - threshold, spread).sum(axis=0)
+            probabilities[:, column] += smoothed_probability(likelihood, side * margins, spread).sum(axis=0)
     probabilities /= len(draws["setting"])
     probabilities[:, TIED] = 1 - probabilities[:, :TIED].sum(axis=1) if "tie_threshold" in draws else 0.0
     return probabilities

@@ -76,10 +76,10 @@ def _simulated(
         float(max(tree.attrs["number_of_preferences"], 1)),
         steepness=drawn["steepness"].values.reshape(-1, 1)[every],
         lapse_rate=lapse_rates,
+        tie_threshold=drawn["tie_threshold"].values.reshape(-1, 1)[every] if "tie_threshold" in drawn else None,
+        indifferent=np.zeros(margins.shape[1], dtype=bool),
     )
-    threshold = drawn["tie_threshold"].values.reshape(-1, 1)[every] if "tie_threshold" in drawn else 0.0
-    # Rao & Kupper (1967): p(t − δ) and p(−t − δ)
-    above, below = prob(likelihood, margins - threshold), prob(likelihood, -margins - threshold)
+    above, below = prob(likelihood, margins), prob(likelihood, -margins)
     uniform = rng.random(margins.shape)
     return np.where(uniform < above, 1, np.where(uniform >= 1 - below, -1, 0))
 

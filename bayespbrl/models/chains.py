@@ -26,7 +26,7 @@ from bayespbrl.models.gibbs import (
     reference_scale,
     stacked,
 )
-from bayespbrl.models.likelihoods import WithTies, has_steps, log_prob, total_log_prob
+from bayespbrl.models.likelihoods import has_steps, log_prob, ties_of, total_log_prob
 from bayespbrl.models.low_rank import used_rows
 from bayespbrl.models.preference_problem import (
     PreferenceProblem,
@@ -201,7 +201,7 @@ def joint_problem(fits: Sequence[GaussianFit], by_answerer: Float[np.ndarray, "a
         jnp.full(len(fits), -np.log(len(fits))),
         table(model.steepness_prior),
         table(model.lapse_rate_prior),
-        table(model.tie_threshold_prior if isinstance(likelihood, WithTies) else given(0.0)),
+        table(model.tie_threshold_prior if ties_of(likelihood) is not None else given(0.0)),
         jnp.asarray(one_hot),
         model.steepness_prior.mean if scaled else None,
     )
@@ -224,7 +224,7 @@ def _with_reference(fit: GaussianFit, rank: int, power: float = REFERENCE_POWER)
 
 def _flies(problem: PreferenceProblem) -> bool:
     """Whether the weights move by flights too: many answers, and one step each."""
-    steps = has_steps(problem.likelihood) and not isinstance(problem.likelihood, WithTies)
+    steps = has_steps(problem.likelihood) and ties_of(problem.likelihood) is None
     return problem.loadings.shape[-2] > FEW and steps
 
 

@@ -5,7 +5,7 @@ logistic function is a scale mixture of normal distribution functions (Andrews &
 distributed). Expectation propagation has one closed form for all of them, at any steepness.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -169,24 +169,32 @@ class Probit:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class WithLapses:
-    """A constant share of coin tosses around any likelihood: λ/2 + (1 − λ) p, so 20 % wrong answers are λ = 0.4.
+    """A constant share of answers at random around any likelihood: λ/g + (1 − λ) p, each of g answers equally probable.
+
+    They are two, coin tosses, so that 20 % wrong answers are λ = 0.4; where ties are possible, three. Answers that
+    contradict each other then always have a probability, ties too.
 
     Source: Wichmann & Hill (2001), eq. 1, with equal rates of guesses and lapses.
 
     Attributes:
-      attentive: the likelihood p of an answer that is not a coin toss.
+      attentive: the likelihood p of an answer that is not given at random.
       lapse_rate: λ in (0, 1).
     """
 
-    attentive: Mixed | Logistic | Probit
+    attentive: Likelihood
     lapse_rate: Scalar
+
+    @property
+    def choices(self) -> int:
+        """g."""
+        return 3 if isinstance(self.attentive, WithTies) else 2
 
     def factor(self, margins: Margins) -> tuple[Values, Values]:
         """e is the larger exponent of both terms."""
         exponent, ratio = self.attentive.factor(margins)
-        floor = jnp.log(self.lapse_rate / 2)
+        floor = jnp.log(self.lapse_rate / self.choices)
         above = exponent > floor
-        smaller = jnp.exp(-jnp.abs(exponent - floor))  # of exp(e) and λ/2, over the larger
+        smaller = jnp.exp(-jnp.abs(exponent - floor))  # of exp(e) and λ/g, over the larger
         lapsed, attentive = jnp.where(above, smaller, 1.0), jnp.where(above, 1.0, smaller)
         # Wichmann & Hill (2001), eq. 1
         return jnp.maximum(exponent, floor), lapsed + (1 - self.lapse_rate) * attentive * ratio
@@ -195,13 +203,14 @@ class WithLapses:
         """The mixture shrunk, and a constant."""
         constant, weights, offsets, scales = self.attentive.probit_mixture()
         lapses, keep = float(self.lapse_rate), 1 - float(self.lapse_rate)
-        return ProbitMixture(lapses / 2 + keep * constant, keep * weights, offsets, scales)  # Wichmann & Hill (2001)
+        # Wichmann & Hill (2001), eq. 1
+        return ProbitMixture(lapses / self.choices + keep * constant, keep * weights, offsets, scales)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class WithTies:
-    """A threshold within which people say "no difference" (Rao & Kupper 1967), around any likelihood above.
+    """A threshold within which people say "no difference" (Rao & Kupper 1967), around a likelihood without lapses.
 
     p(≻) = p(t − δ), p(≺) = p(−t − δ), p(tie) = p(t + δ) − p(t − δ); they sum to one because p(t) + p(−t) = 1.
 
@@ -211,7 +220,7 @@ class WithTies:
       indifferent: which answers were "no difference", in the order of the margins' last axis.
     """
 
-    ordered: Mixed | Logistic | Probit | WithLapses
+    ordered: Mixed | Logistic | Probit
     threshold: Scalar
     indifferent: Bool[Array, "*b k"] | Bool[np.ndarray, "*b k"]
 
@@ -244,9 +253,24 @@ class WithTies:
 
 def has_steps(likelihood: Likelihood) -> bool:
     """Whether the likelihood jumps, as eq. 8 does. Given many answers the posterior of any other is nearly Gaussian."""
-    if isinstance(likelihood, WithTies):
-        return has_steps(likelihood.ordered)
-    return has_steps(likelihood.attentive) if isinstance(likelihood, WithLapses) else isinstance(likelihood, Mixed)
+    likelihood = likelihood.attentive if isinstance(likelihood, WithLapses) else likelihood
+    return isinstance(likelihood.ordered if isinstance(likelihood, WithTies) else likelihood, Mixed)
+
+
+def ties_of(likelihood: Likelihood) -> WithTies | None:
+    """The part of the likelihood that has a threshold; None where there is none."""
+    likelihood = likelihood.attentive if isinstance(likelihood, WithLapses) else likelihood
+    return likelihood if isinstance(likelihood, WithTies) else None
+
+
+def with_threshold(
+    likelihood: Likelihood, threshold: Scalar, indifferent: Bool[Array, "*b k"] | Bool[np.ndarray, "*b k"]
+) -> Likelihood:
+    """A likelihood without ties, with this threshold; `indifferent` as in `WithTies`."""
+    if isinstance(likelihood, WithLapses):
+        return replace(likelihood, attentive=with_threshold(likelihood.attentive, threshold, indifferent))
+    assert isinstance(likelihood, Mixed | Logistic | Probit)
+    return WithTies(likelihood, threshold, indifferent)
 
 
 def likelihood_of(
@@ -278,7 +302,7 @@ def likelihood_of(
     if tie_threshold is None:
         return ordered
     assert indifferent is not None
-    return WithTies(ordered, tie_threshold, indifferent)
+    return with_threshold(ordered, tie_threshold, indifferent)
 
 
 def smoothed_probability(
@@ -288,7 +312,11 @@ def smoothed_probability(
     if isinstance(likelihood, WithLapses):
         # Wichmann & Hill (2001), eq. 1
         lapses = np.asarray(likelihood.lapse_rate)
-        return np.asarray(lapses / 2 + (1 - lapses) * smoothed_probability(likelihood.attentive, margins, spread))
+        attentive = smoothed_probability(likelihood.attentive, margins, spread)
+        return np.asarray(lapses / likelihood.choices + (1 - lapses) * attentive)
+    if isinstance(likelihood, WithTies):
+        # Rao & Kupper (1967): p(t − δ)
+        return smoothed_probability(likelihood.ordered, margins - np.asarray(likelihood.threshold), spread)
     if isinstance(likelihood, Mixed):
         share = 1 / np.asarray(likelihood.number_of_preferences)
         smooth = smoothed_probability(Logistic(likelihood.steepness), margins, spread)

@@ -15,7 +15,7 @@ from bayespbrl.models.chains import CHUNK, LEAST_LAPSES, Chains
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.evidence import log_evidence
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, refitted
-from bayespbrl.models.likelihoods import WithTies, has_steps
+from bayespbrl.models.likelihoods import has_steps, ties_of
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
 
@@ -70,7 +70,7 @@ def sample_posterior(
         (length scales, or other features), equally probable a priori: shape (C, K, D).
       prior_scale: σ > 0.
       steepness: m > 0.
-      lapse_rate: λ in [0, 1), the share of answers that are coin tosses.
+      lapse_rate: λ in [0, 1), the share of answers given at random.
       likelihood: "mixed" (eq. 8), "logistic" or "probit".
       indifferent: which answers were "no difference", shape (K,) bool. The sign of such a row does not matter. None:
         nobody could say so.
@@ -165,7 +165,7 @@ def _needs_better_references(chains: Chains, fit: GaussianFit, model: Preference
     moved from one setting to another no longer leave the margins of ties within it.
     """
     unknown = None in (model.steepness, model.lapse_rate) or has_steps(fit.likelihood)
-    return unknown if chains.many else isinstance(fit.likelihood, WithTies) and model.tie_threshold is None
+    return unknown if chains.many else ties_of(fit.likelihood) is not None and model.tie_threshold is None
 
 
 def _with_better_references(

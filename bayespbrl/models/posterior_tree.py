@@ -13,7 +13,7 @@ from bayespbrl import checks
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import Convergence
 from bayespbrl.models.gaussian_fit import GaussianFit
-from bayespbrl.models.likelihoods import WithTies
+from bayespbrl.models.likelihoods import ties_of
 from bayespbrl.models.low_rank import UtilityWeights, low_rank
 from bayespbrl.models.preference_model import Answers
 from bayespbrl.models.priors import SIDE_BIAS_SCALE
@@ -90,7 +90,7 @@ def posterior_tree(
         "steepness": (SAMPLE, chains.values("steepness", length)),
         "lapse_rate": ((*SAMPLE, "answerer"), chains.values("lapse_rate", length)),
     }
-    if isinstance(likelihood, WithTies):
+    if ties_of(likelihood) is not None:
         draws["tie_threshold"] = (SAMPLE, chains.values("tie_threshold", length))
     parts = {"shown_first": answers.shown_first, "answerers": answers.answerers}
     known = {name: ("preference", x) for name, x in parts.items() if x is not None}

@@ -25,7 +25,8 @@ class PreferenceModel:
     Attributes:
       prior_scale: σ > 0, standard deviation of each weight, in utility per feature.
       steepness: m > 0, slope of the sigmoid, in 1/utility; None: inferred.
-      lapse_rate: λ in [0, 1), the probability that an answer is a coin toss; None: inferred, for each answerer.
+      lapse_rate: λ in [0, 1), the probability that an answer is given at random, of two or, with ties, of three; None:
+        inferred, for each answerer.
       likelihood: "mixed" (eq. 8), "logistic" (Bradley-Terry) or "probit" (Thurstone).
       tie_threshold: δ > 0, in utility: margins within it are often answered with "no difference". None: inferred where
         answers are said to be such or not, and no threshold where nothing is said.

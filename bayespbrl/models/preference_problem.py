@@ -14,7 +14,7 @@ from jax import Array, random
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from bayespbrl.models.elliptical_slice import Ellipse
-from bayespbrl.models.likelihoods import Likelihood, Scalar, WithTies, total_log_prob
+from bayespbrl.models.likelihoods import Likelihood, Scalar, WithLapses, WithTies, total_log_prob
 from bayespbrl.models.low_rank import used_rows
 from bayespbrl.models.preference_model import preference_model
 
@@ -197,6 +197,8 @@ def _capacity(number: int) -> int:
 
 def _padded_likelihood(likelihood: Likelihood, capacity: int) -> Likelihood:
     """The likelihood with an entry for every padded row."""
+    if isinstance(likelihood, WithLapses):
+        return replace(likelihood, attentive=_padded_likelihood(likelihood.attentive, capacity))
     if isinstance(likelihood, WithTies):
         tied = np.asarray(likelihood.indifferent)
         return replace(likelihood, indifferent=np.pad(tied, (0, capacity - len(tied))))

@@ -11,7 +11,7 @@ from bayespbrl import queries, questions
 from bayespbrl.envs.opening import environment_name
 from bayespbrl.events import LearnerState
 from bayespbrl.learner import Learner
-from bayespbrl.models.likelihoods import Likelihood, prob
+from bayespbrl.models.likelihoods import Likelihood, prob, with_threshold
 from bayespbrl.people.clips import Clip
 from bayespbrl.preferences import Answer, Query
 from bayespbrl.settings import MOST_UNASKED
@@ -96,7 +96,8 @@ def with_ties(
     """
     if thresholds is None:
         return likely
-    first, second = (float(prob(likelihood, sign * margins - thresholds).mean()) for sign in (1, -1))
+    likelihood = with_threshold(likelihood, thresholds, np.zeros(1, dtype=bool))
+    first, second = (float(prob(likelihood, sign * margins).mean()) for sign in (1, -1))
     chances = {Answer.FIRST: first, Answer.SECOND: second, Answer.TIE: 1 - first - second}
     ordered = sorted(chances, key=lambda answer: -chances[answer])
     return (*ordered[:2], Answer.SKIP, ordered[2])
