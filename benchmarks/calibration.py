@@ -14,7 +14,7 @@ of the posterior draws that called it one (agreement), and by the schedule's sig
 neither.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -63,12 +63,15 @@ def print_gains(studies: list[str], statistic: str) -> None:
         print(f"| {one['lower']:g}–{one['upper']:g} | {one['updates']:.0f} | {shares} |")
 
 
-def main(studies: list[str]) -> None:
+def main() -> None:
     """Print the tables as markdown."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("studies", nargs="+", help="a run directory, or a folder of them")
+    studies = parser.parse_args().studies
     print(markdown(pd.DataFrame([row(Path(study)) for study in studies])), flush=True)
     for statistic in ("agreement", "signal"):
         print_gains(studies, statistic)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -363,9 +363,9 @@ def test_whoever_mostly_tosses_coins_is_to_be_dropped_and_who_often_does_to_be_t
     surely, often, never = [0.6, 0.7, 0.8], [0.2, 0.3, 0.4], [0.0, 0.1, 0.3]
     answers = [PastQuestion(k, 0, 1, 1, None, Answer.FIRST, name, 5.0) for k, name in enumerate(("Ada", "Bob", "Cy"))]
     drop, trust = advised(answers, {"Ada": surely, "Bob": often, "Cy": never})
-    assert drop[0].startswith("Ada: 70 % of the answers look like coin tosses")
+    assert drop[0].startswith("Ada: 70 % of the answers look random")
     assert drop[1] == "Drop them. run.estimate_without('Ada') infers the utility without them."
-    assert trust[0].startswith("Bob: 30 % of the answers look like coin tosses")
+    assert trust[0].startswith("Bob: 30 % of the answers look random")
     assert trust[1].startswith("The posterior already trusts them less.")
     assert [remedy for _, remedy in advised(answers[:1], {"Ada": surely})] == ["Start a new run with someone else."]
 

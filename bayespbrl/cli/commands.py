@@ -85,7 +85,7 @@ RUN_OPTIONS = {
     "prior_scale": "Prior standard deviation of each utility weight.",
     "steepness": "Steepness of the likelihood, for feature differences of root mean square length 1; inferred if "
     "omitted, or 5 with --hyperparameters given.",
-    "lapse_rate": "Share of answers modelled as coin tosses, in [0, 1); inferred if omitted, or 0 with "
+    "lapse_rate": "Share of answers modelled as given at random, in [0, 1); inferred if omitted, or 0 with "
     "--hyperparameters given.",
     "discount": "Discount of Q, in [0, 1); the paper's is 0.98.",
     "trajectory_discount": "Discount of the trajectory features, in [0, 1]: 1 by default, because experts judge whole "

@@ -30,7 +30,7 @@ def people_section(contents: RunContents) -> Body:
     given = contents.model.lapse_rate is not None
     rows = [_row(table.isel(answerer=place), given=given) for place in range(table.sizes["answerer"])]
     caption = (
-        "Everyone who answered, with 90 % intervals. Lapse rate: the share of answers that are coin tosses. Side bias: "
+        "Everyone who answered, with 90 % intervals. Lapse rate: the share of answers given at random. Side bias: "
         "how much better the trajectory shown first looks, in standard deviations of the utility differences. Same on "
         "repeats: how many repeated questions were answered as before, with the exact interval of the share. "
         "Median time: the interval holds the median of all their answers, by order statistics; from five times on."
@@ -84,10 +84,10 @@ def _of_one(one: xr.Dataset, *, several: bool) -> Iterator[ReportWarning]:
     others = f"run.estimate_without({who!r}) infers the utility without them."
     rate, lower, upper = (float(one[f"lapse_rate{end}"]) for end in ("", "_lower", "_upper"))
     if lower > LITTLE_WORTH:
-        what = f"{who}: {percent(rate)} of the answers look like coin tosses ({percent(lower)} to {percent(upper)})."
+        what = f"{who}: {percent(rate)} of the answers look random ({percent(lower)} to {percent(upper)})."
         yield ReportWarning(what, f"Drop them. {others}" if several else "Start a new run with someone else.")
     elif lower > LESS_TRUST:
-        what = f"{who}: {percent(rate)} of the answers look like coin tosses ({percent(lower)} to {percent(upper)})."
+        what = f"{who}: {percent(rate)} of the answers look random ({percent(lower)} to {percent(upper)})."
         yield ReportWarning(what, "The posterior already trusts them less. Ask more questions to make up for it.")
     repeated, consistent = int(one["repeated"]), int(one["consistent"])
     if float(one["consistency_upper"]) < RARELY_CONSISTENT:
