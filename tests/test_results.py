@@ -12,7 +12,7 @@ from test_cli import call, refused
 from test_trials import without_processes
 
 from bayespbrl.diagnostics.report.contents import read_contents
-from bayespbrl.results import calibration_table, kept_table, read_study, values_table, write_results
+from bayespbrl.results import calibration_table, kept_table, pairs_table, read_study, values_table, write_results
 from bayespbrl.results.intervals import (
     answers_for_good,
     benjamini_hochberg,
@@ -126,6 +126,19 @@ def test_kept_policies_stand_beside_the_newest_and_the_best_of_their_runs(made):
     lines.loc[ended, "value"] = [40, 40, 40, 93]
     lines.to_csv(made / "iterations.csv", index=False)
     assert kept_table(read_study(made)).loc[0, "within 3 % of the best"] == "3 of 4"
+
+
+def test_pairs_of_trials_are_counted_by_the_answers_that_they_needed(made):
+    assert pairs_table(read_study(made)).empty  # no value is declared
+    declared = made / "study.toml"
+    declared.write_text(declared.read_text().replace("[tasks.gridworld]", "[tasks.gridworld]\ngood_above = 50"))
+    second, known = pairs_table(read_study(made)).to_dict("records")
+    assert (second["pairs"], second["fewer in all"], second["more in all"], second["p in all"]) == ("4", "0", "0", "1")
+    # `first` is above 50 from the third answer on, but for its last policy of seed 4
+    assert (second["fewer to 50"], second["more to 50"], second["p to 50"]) == ("0", "4", "0.12")
+    assert second["median to 50"] == "5 against 3"
+    assert (second["fewer to 50 for good"], second["more to 50 for good"]) == ("1", "3")
+    assert (known["fewer to 50"], known["more to 50"], known["p to 50"]) == ("4", "0", "0.12")
 
 
 def test_predictions_are_pooled_over_tasks_and_not_over_methods():

@@ -61,6 +61,14 @@ def paired_difference(values: np.ndarray, reference: np.ndarray) -> tuple[Interv
     return median_interval(differences), float(stats.wilcoxon(differences, zero_method="pratt").pvalue)
 
 
+def sign_test(less: int, more: int) -> float:
+    """The two-sided p value of the sign test: pairs of which one side is less, and more; equal ones do not count.
+
+    Source: Dixon & Mood (1946).
+    """
+    return float(stats.binomtest(less, less + more).pvalue) if less + more else 1.0
+
+
 def failed_trials(failed: int, trials: int) -> Interval:
     """The share of failed trials with its exact interval (Clopper & Pearson 1934)."""
     bounds = stats.binomtest(failed, trials).proportion_ci(LEVEL, method="exact")

@@ -14,6 +14,7 @@ from bayespbrl.results.intervals import (
     holm,
     median_interval,
     paired_difference,
+    sign_test,
 )
 from bayespbrl.results.study_data import RowData, StudyData
 from bayespbrl.studies.declaration import AXES
@@ -102,6 +103,44 @@ def _compared(row: RowData, reference: RowData) -> tuple[str, float, str]:
     )
     difference, p = paired_difference(values, before)
     return _with_bounds(difference, lambda number: f"{number:+.3g}"), p, str(budget)
+
+
+def pairs_table(data: StudyData) -> pd.DataFrame:
+    """Pairs of trials with the first row of the same task: how often one needed fewer answers, and how often more.
+
+    In all; until its kept policy is first better than the task's `good_above`; and until it is for good. No lines where
+    no task declares that.
+    """
+    lines = []
+    for task in data.tasks:
+        reference, *others = [row for row in data.of_task(task) if not row.declared.untrained] or [None]
+        for row in others:
+            if reference is None or (level := row.declared.good_above) is None:
+                continue
+            shared = sorted(set(row.seeds) & set(reference.seeds))
+            places = [[side.seeds.index(seed) for seed in shared] for side in (row, reference)]
+            line = dict(zip(AXES, row.declared.levels, strict=True)) | {"pairs": str(len(shared))}
+            for name, needed in (
+                ("in all", [side.used for side in (row, reference)]),
+                (f"to {level:g}", [_answers_above(side, level) for side in (row, reference)]),
+                (f"to {level:g} for good", [_answers_above(side, level, for_good=True) for side in (row, reference)]),
+            ):
+                mine, its = (part[place] for part, place in zip(needed, places, strict=True))
+                fewer, more = int(np.sum(mine < its)), int(np.sum(mine > its))
+                line |= {f"median {name}": f"{np.median(mine):g} against {np.median(its):g}"}
+                line |= {f"fewer {name}": str(fewer), f"more {name}": str(more)}
+                line |= {f"p {name}": f"{sign_test(fewer, more):.2g}"}
+            lines.append(line)
+    table = pd.DataFrame(lines)
+    return table.reindex(columns=_present(table)) if len(table) else table
+
+
+def _answers_above(row: RowData, level: float, *, for_good: bool = False) -> np.ndarray:
+    """Answers of each trial by which its kept policy is better than `level`, infinity for never, shape (S,)."""
+    better = row.values > level
+    if for_good:
+        better = np.flip(np.logical_and.accumulate(np.flip(better, 1), axis=1), 1)
+    return np.where(better.any(axis=1), row.answers[better.argmax(axis=1)], np.inf)
 
 
 def _number(value: float) -> str:

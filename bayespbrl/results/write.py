@@ -9,7 +9,15 @@ from bayespbrl.figures import png
 from bayespbrl.results.figures import curves_figure, profiles_figure
 from bayespbrl.results.predictions import write_predictions
 from bayespbrl.results.study_data import StudyData, read_study
-from bayespbrl.results.tables import MISSING, calibration_table, kept_table, markdown, runs_table, values_table
+from bayespbrl.results.tables import (
+    MISSING,
+    calibration_table,
+    kept_table,
+    markdown,
+    pairs_table,
+    runs_table,
+    values_table,
+)
 from bayespbrl.runs.files import write_file
 from bayespbrl.studies.declaration import parsed
 from bayespbrl.studies.study import Study, read_study_json
@@ -17,6 +25,7 @@ from bayespbrl.studies.study import Study, read_study_json
 TITLES = {
     "values": "Values",
     "kept": "The kept policies",
+    "pairs": "Answers needed, in pairs of trials",
     "calibration": "Calibration of the predicted answers",
     "runs": "Settings, convergence and updates of the runs",
 }
@@ -37,7 +46,13 @@ def refreshed(directory: Path) -> StudyData:
 
 def tables_of(data: StudyData) -> dict[str, pd.DataFrame]:
     """The non-empty tables of a study, by name."""
-    makers = {"values": values_table, "kept": kept_table, "calibration": calibration_table, "runs": runs_table}
+    makers = {
+        "values": values_table,
+        "kept": kept_table,
+        "pairs": pairs_table,
+        "calibration": calibration_table,
+        "runs": runs_table,
+    }
     tables = {name: make(data) for name, make in makers.items()}
     return {name: table for name, table in tables.items() if len(table)}
 
@@ -52,6 +67,9 @@ def section(data: StudyData, name: str, table: pd.DataFrame) -> str:
         f"of failed trials exact (Clopper and Pearson). For good: and never below again.",
         "kept": "Value, median [lower quartile], of the policy that a run keeps, of its newest, and of the best of the "
         "run, which only the hidden reward knows. Within 3 % of the best: of what that gains over the random policy.",
+        "pairs": "Pairs of the same seed, with the first row of the task: in how many the trial needed fewer answers, "
+        "and more; in all, until its kept policy is better than the value, and until it stays so. p: two-sided sign "
+        "tests, not adjusted for their number.",
         "calibration": "Each answer was predicted before it was given. `z` below −2: overconfident, above 2: "
         "underconfident. ECE: expected calibration error, and that of calibrated predictions, by chance.",
         "runs": "Fits: posteriors over all trials and iterations. ESS: effective sample size of the worst margin. "

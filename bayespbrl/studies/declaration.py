@@ -10,6 +10,7 @@ preset = "paper"
 [tasks.gridworld]                # the task's name, or `env = "..."`
 minutes = 1.5                    # of a trial on one core, for --dry-run
 failed_below = 150               # a trial that ends below this value has failed
+good_above = 280                 # after how many answers a trial's kept policy is better than this is counted in pairs
 
 [methods.posterior-mean]         # the first row of a task is what its others are compared with
 [methods.random-policy]
@@ -42,7 +43,7 @@ from bayespbrl.settings import OPTIONS
 AXES = ("tasks", "methods", "noise", "variants")
 OWN = ("title", "trials", "seed", "report_at", "options", "leave_out", *AXES)
 OF_A_LEVEL = {
-    "tasks": ("env", "minutes", "failed_below"),
+    "tasks": ("env", "minutes", "failed_below", "good_above"),
     "methods": ("untrained", "baseline", "minutes"),
     "variants": ("minutes",),
 }
@@ -62,6 +63,7 @@ class DeclaredRow:
       baseline: the algorithm of `bayespbrl.baselines` that runs instead of the learner; None: the learner.
       minutes: of a trial on one core, as declared; None: not known.
       failed_below: a trial that ends below this value has failed; None: not declared.
+      good_above: value of a policy that counts as good; None: not declared.
     """
 
     levels: tuple[str, str, str, str]
@@ -71,6 +73,7 @@ class DeclaredRow:
     minutes: float | None = None
     failed_below: float | None = None
     baseline: str | None = None
+    good_above: float | None = None
 
     @property
     def name(self) -> str:
@@ -168,7 +171,7 @@ def _axis(where: str, axis: str, content: Mapping[str, Any]) -> dict[str, Option
             raise ValueError(f"{place}: expected a name of letters, digits, dots and dashes, got {level!r}")
         own = OF_A_LEVEL.get(axis, ())
         _options(place, {name: value for name, value in _table(place, options).items() if name not in own})
-        for name in {"minutes", "failed_below"} & set(options):
+        for name in {"minutes", "failed_below", "good_above"} & set(options):
             checks.number(f"{place}, {name}", options[name])
         if not isinstance(options.get("env", ""), str) or not isinstance(options.get("untrained", False), bool):
             raise ValueError(f"{place}: expected env as text and untrained as true or false, got {dict(options)}")
@@ -225,4 +228,5 @@ def _row(common: Options, chosen: tuple[tuple[str, Options], ...]) -> DeclaredRo
         own["minutes"],
         own["failed_below"],
         own["baseline"],
+        own["good_above"],
     )
