@@ -34,7 +34,7 @@ import xarray as xr
 from scipy import stats
 
 from bayespbrl.models import Answers, EllipticalSlice, PreferenceModel, chains, gibbs, low_rank, posterior_draws
-from bayespbrl.models.likelihoods import Likelihood, likelihood_of, prob
+from bayespbrl.models.likelihoods import Likelihood, likelihood_of, prob, with_threshold
 from bayespbrl.models.posterior import SamplerOptions
 from bayespbrl.queries import expected_information
 
@@ -116,16 +116,14 @@ def _log_likelihood(
     """Of all answers, in each draw and in truth."""
     differences = features[:, pairs[:, 0]] - features[:, pairs[:, 1]]
     margins, true_margins = _margins(differences, drawn), differences[truth["setting"]] @ truth["weights"]
-    true = likelihood_of("mixed", float(MOST_ANSWERS), steepness=truth["steepness"], lapse_rate=truth["lapse"])
-    threshold = drawn["tie_threshold"].values.reshape(-1, 1) if "tie_threshold" in drawn else 0.0
-    return _of_answers(_likelihood(drawn), margins, threshold, tied), float(
-        _of_answers(true, true_margins, truth["threshold"], tied)
-    )
+    likelihood = _likelihood(drawn)
+    if "tie_threshold" in drawn:
+        likelihood = with_threshold(likelihood, drawn["tie_threshold"].values.reshape(-1, 1), np.zeros(len(tied), bool))
+    return _of_answers(likelihood, margins, tied), float(_of_answers(_true_likelihood(truth), true_margins, tied))
 
 
-def _of_answers(likelihood: Likelihood, margins: np.ndarray, threshold: Any, tied: np.ndarray) -> np.ndarray:
-    # Rao & Kupper (1967): p(tie) = 1 − p(t − δ) − p(−t − δ)
-    above, below = prob(likelihood, margins - threshold), prob(likelihood, -margins - threshold)
+def _of_answers(likelihood: Likelihood, margins: np.ndarray, tied: np.ndarray) -> np.ndarray:
+    above, below = prob(likelihood, margins), prob(likelihood, -margins)
     return np.asarray(np.sum(np.log(np.maximum(np.where(tied, 1 - above - below, above), 1e-300)), axis=-1))
 
 
@@ -177,10 +175,21 @@ def _truth(rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
+def _true_likelihood(truth: dict[str, Any]) -> Likelihood:
+    """Of an answer that states an order."""
+    return likelihood_of(
+        "mixed",
+        float(MOST_ANSWERS),
+        steepness=truth["steepness"],
+        lapse_rate=truth["lapse"],
+        tie_threshold=truth["threshold"] or None,
+        indifferent=np.zeros(1, dtype=bool),
+    )
+
+
 def _answer(rng: np.random.Generator, margin: float, truth: dict[str, Any]) -> int:
     """1: the first, −1: the second, 0: no difference."""
-    likelihood = likelihood_of("mixed", float(MOST_ANSWERS), steepness=truth["steepness"], lapse_rate=truth["lapse"])
-    above, below = prob(likelihood, np.array([margin, -margin]) - truth["threshold"])
+    above, below = prob(_true_likelihood(truth), np.array([margin, -margin]))
     return int(rng.choice([1, -1, 0], p=[above, below, max(1 - above - below, 0.0)]))
 
 
