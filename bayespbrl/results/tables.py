@@ -113,9 +113,10 @@ def pairs_table(data: StudyData) -> pd.DataFrame:
     """
     lines = []
     for task in data.tasks:
-        reference, *others = [row for row in data.of_task(task) if not row.declared.untrained] or [None]
-        for row in others:
-            if reference is None or (level := row.declared.good_above) is None:
+        learned = [row for row in data.of_task(task) if not row.declared.untrained]
+        for row in learned[1:]:
+            reference, level = learned[0], row.declared.good_above
+            if level is None:
                 continue
             shared = sorted(set(row.seeds) & set(reference.seeds))
             places = [[side.seeds.index(seed) for seed in shared] for side in (row, reference)]
