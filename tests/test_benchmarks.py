@@ -234,9 +234,9 @@ def test_simulated_people_answer_as_their_parameters_say():
         seen, lapse = 0.4 + someone.biases[who], someone.lapse_rates[who]
         first, second = (1 / (1 + np.exp(-2 * (side * seen - 0.5))) for side in (1, -1))
         expected = [
-            lapse / 2 + (1 - lapse) * second,
-            (1 - lapse) * (1 - first - second),
-            lapse / 2 + (1 - lapse) * first,
+            lapse / 3 + (1 - lapse) * second,
+            lapse / 3 + (1 - lapse) * (1 - first - second),
+            lapse / 3 + (1 - lapse) * first,
         ]
         np.testing.assert_allclose([np.mean(answers == a) for a in (-1, 0, 1)], expected, atol=0.015)
 
