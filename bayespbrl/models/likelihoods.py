@@ -253,13 +253,15 @@ class WithTies:
 
 def has_steps(likelihood: Likelihood) -> bool:
     """Whether the likelihood jumps, as eq. 8 does. Given many answers the posterior of any other is nearly Gaussian."""
-    likelihood = likelihood.attentive if isinstance(likelihood, WithLapses) else likelihood
+    if isinstance(likelihood, WithLapses):
+        return has_steps(likelihood.attentive)
     return isinstance(likelihood.ordered if isinstance(likelihood, WithTies) else likelihood, Mixed)
 
 
 def ties_of(likelihood: Likelihood) -> WithTies | None:
     """The part of the likelihood that has a threshold; None where there is none."""
-    likelihood = likelihood.attentive if isinstance(likelihood, WithLapses) else likelihood
+    if isinstance(likelihood, WithLapses):
+        return ties_of(likelihood.attentive)
     return likelihood if isinstance(likelihood, WithTies) else None
 
 
