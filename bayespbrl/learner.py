@@ -39,7 +39,8 @@ class Learner:
       query: the rule for questions by name, or one of your own (`bayespbrl.queries`).
       entries: events of a run to continue.
       kept: the settings of that run, which hold then as they are.
-      **options: those of `Settings`, named alone, over the preset of the environment.
+      **options: any option of `Settings` or its parts by its own name, such as `answers=12`; the preset gives the
+        others. `learner.settings.options()` has all of them with their values.
 
     Raises:
       ValueError: an unknown environment or option, a value out of range, or no time limit known.
@@ -110,7 +111,7 @@ class Learner:
 
     @property
     def policy(self) -> Any:
-        """The policy that the posterior thinks best of those tried, without its noise; else the newest, with it.
+        """The best policy by the posterior, without its noise; the newest, with it, where updates are not checked.
 
         One that was started anew replaces the policy before it only where it is clearly better.
         """
@@ -161,10 +162,12 @@ class Learner:
 
     @property
     def preferences(self) -> Preferences:
+        """All answers so far, as ordered pairs and ties."""
         return self.state.preferences
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
+        """All trajectories so far, by their numbers."""
         return self.state.trajectories
 
     @property
@@ -294,7 +297,7 @@ class Learner:
             from bayespbrl.people.widget import ComparisonWidget  # here, since people stand above the learner
         except ImportError as error:
             raise ValueError(
-                f"widget: expected the extra people (pip install 'bayespbrl[people]'), got {error}"
+                f"widget: expected the extra people (pip install '.[people]' in the checkout), got {error}"
             ) from error
         return ComparisonWidget(self, most_answers=answers, answerer=answerer, practice=practice)
 

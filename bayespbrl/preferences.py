@@ -56,6 +56,7 @@ class Query:
 
     @property
     def incumbent(self) -> int:
+        """The number of the trajectory that the newcomer is compared with."""
         return self.second if self.newcomer == self.first else self.first
 
 

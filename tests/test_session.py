@@ -719,7 +719,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys, di
     monkeypatch.delattr("bayespbrl.people.page", raising=False)
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    assert "pip install 'bayespbrl[people]'" in refused(monkeypatch, capsys, "ask", directory)
+    assert "pip install '.[people]'" in refused(monkeypatch, capsys, "ask", directory)
     new = tmp_path / "new"
     assert "pip install" in refused(monkeypatch, capsys, "run", "gridworld", "--expert", "page", "--out", new)
     assert not new.exists()

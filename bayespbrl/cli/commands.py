@@ -75,7 +75,8 @@ RUN_OPTIONS = {
     "hyperparameters": "Length scales, steepness and lapse rate: inferred (part of the posterior, unless --steepness "
     "or --lapse-rate sets one) or given (as set, or the paper's).",
     "iterations": "Maximum number of cycles of the four steps; by default they follow from the answers.",
-    "kl_bound": "KL bound of each policy update, in nats.",
+    "kl_bound": "KL bound of each policy update, in nats, with the schedule constant; with confidence only a cap while "
+    "the posterior has not converged.",
     "updates_per_iteration": "Maximum number of policy updates per iteration; the paper's is 1.",
     "clip_steps": "Steps of the random part of each trajectory that a question shows; all of it if omitted.",
     "same_start": "Compare two trajectories from the same start, where resets of the environment by seed allow it.",

@@ -1,5 +1,6 @@
 """What the command line shows: progress, tables and pictures of runs and studies, and questions to a person."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -78,6 +79,7 @@ def ask_on_page(
     from bayespbrl.people.page import Page
     from bayespbrl.people.session import Session
 
+    again = shlex.join(["bayespbrl", "ask", str(directory), *(f"--answerer={name}" for name in answerers)])
     session = Session(learner, most_answers=answers, answerer=answerers or None, practice=practice)
     page = Page(session, host=place.host, port=place.port)
     console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:")
@@ -88,7 +90,7 @@ def ask_on_page(
     try:
         page.serve()
     except KeyboardInterrupt:
-        console.print(f"\nStopped. Nothing is lost: bayespbrl ask {directory}")
+        console.print(f"\nStopped. Nothing is lost: {again}")
         raise
     view = page.session.view
     if view["phase"] == "failed":
@@ -97,7 +99,7 @@ def ask_on_page(
     if learner.finished:
         show_run(learner, directory)
     else:
-        console.print(f"The same command goes on: bayespbrl ask {directory}")
+        console.print(f"This continues: {again}")
 
 
 def check_page_installed() -> None:
@@ -105,7 +107,9 @@ def check_page_installed() -> None:
     try:
         from bayespbrl.people import page  # noqa: F401
     except ImportError as error:
-        raise ValueError(f"page: expected the extra people (pip install 'bayespbrl[people]'), got {error}") from error
+        raise ValueError(
+            f"page: expected the extra people (pip install '.[people]' in the checkout), got {error}"
+        ) from error
 
 
 def show_run(learner: Learner, directory: Path) -> None:

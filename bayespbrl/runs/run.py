@@ -35,8 +35,8 @@ def start(
     Args:
       env: as in `Learner`.
       directory: must not exist; a fresh one under `runs/` when None.
-      **options: as in `Learner`. `expert="other"` is for an expert of your own: such a run continues in Python only,
-        not with `bayespbrl resume`.
+      **options: as in `Learner`. With `expert="other"` a person answers through code of your own: the learner uses its
+        settings for people, infers a side bias, and continues in Python only, not with `bayespbrl resume`.
 
     Raises:
       ValueError: bad options, or a directory that exists; nothing is left behind then.
@@ -140,6 +140,7 @@ class Run:
 
     @property
     def settings(self) -> Settings:
+        """All options of the run."""
         return self.learner.settings
 
     @property
@@ -169,10 +170,12 @@ class Run:
 
     @property
     def preferences(self) -> Preferences:
+        """All answers, as ordered pairs and ties."""
         return self.learner.preferences
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
+        """All trajectories, by their numbers."""
         return self.learner.trajectories
 
     @property

@@ -121,7 +121,9 @@ class Settings:
       environment: `named`, which `env` opens again, or `other`, an object of the user's.
       expert, wrong_answers: who answers, and the share of a simulated expert's answers that are reversed; a stopped run
         finds its expert again by them.
-      model, estimation, features, critic, update, rollouts, questions: the options of each part.
+      model, estimation, features, critic, update, rollouts, questions: the options of each part, documented there:
+        `PreferenceModel` (models), `Estimation` (utility), `Features` and `Rollouts` (here), `Critic` and
+        `PolicyUpdate` (improvement), `Questions` (questions).
     """
 
     env: str

@@ -21,7 +21,7 @@ def scheduler_executor(address: str) -> Iterator[Executor]:
         from distributed import Client
     except ImportError as error:
         raise ValueError(
-            f"scheduler: expected the extra cluster (pip install 'bayespbrl[cluster]'), got {error}"
+            f"scheduler: expected the extra cluster (pip install '.[cluster]' in the checkout), got {error}"
         ) from error
     try:
         client = Client(address, timeout=WAIT, set_as_default=False)

@@ -104,14 +104,17 @@ def infer_utility(
       feature_sums: ψ of n trajectories, or the features of n items of any kind, shape (n, D).
       pairs: ordered pairs (preferred, dominated) of their row numbers.
       ties: pairs that were answered with "no difference". There are K pairs and ties in all.
-      shown_first: as in `sample_posterior`, for the pairs and then the ties: a side bias is inferred.
+      shown_first: 1 where the first of the pair was shown first, −1 where the second was, 0 where nothing is known,
+        shape (K,), for the pairs and then the ties: a side bias is inferred. None: there is none.
       answerers: who gave each answer, names or numbers from 0, in the same order: each has a lapse rate and, with
         `shown_first`, a side bias. `posterior["posterior"]["lapse_rate"].sel(answerer="Ada")` are the draws of one.
       features: φ, where utilities of single states are wanted too; None: the rows themselves.
       method: `posterior-mean`; `most-likely`; `posterior-draw`, one draw picked by `seed`, with directions that the
         answers do not touch at their mean, zero; or `linear-program`, which leaves ties out.
       discount: γ of ψ, for trajectories that the estimate is asked about later.
-      prior_scale, steepness, lapse_rate, likelihood, tie_threshold: as in `PreferenceModel`; None: inferred.
+      prior_scale: σ > 0 of the weights.
+      likelihood: `mixed` (eq. 8), `logistic` or `probit`.
+      steepness, lapse_rate, tie_threshold: None: inferred, the threshold where there are ties.
       seed: of the sampler.
 
     Raises:
