@@ -1,10 +1,10 @@
-"""Figures without matplotlib's global state; it is imported only where one is drawn."""
+"""Figures without matplotlib's global state, which is imported where one is drawn; what is shown of many pictures."""
 
 import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,3 +31,8 @@ def pixels(figure: "Figure") -> UInt8[np.ndarray, "height width 4"]:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba()).copy()
+
+
+def spread(number: int, most: int) -> Int[np.ndarray, " n"]:
+    """At most `most` of the indices below `number`, evenly spread, first and last among them."""
+    return np.linspace(0, number - 1, min(number, most)).round().astype(int)

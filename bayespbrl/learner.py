@@ -9,7 +9,8 @@ import numpy as np
 
 from bayespbrl import events, queries, rollouts
 from bayespbrl.cycle import Cycle
-from bayespbrl.envs.opening import AnyEnvironment, as_given, environment_attribute, environment_name, given_by_name
+from bayespbrl.envs import opening
+from bayespbrl.envs.opening import AnyEnvironment
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
@@ -58,8 +59,8 @@ class Learner:
         kept: Settings | None = None,
         **options: Any,
     ):
-        self.environment = rollouts.open_environment(env)
-        self.given = env if isinstance(env, gymnasium.Env) else as_given(self.environment)
+        self.environment = opening.open_environment(env)
+        self.given = env if isinstance(env, gymnasium.Env) else opening.as_given(self.environment)
         for name, given in (("features", features), ("schedule", schedule), ("query", query)):
             if given is not None and not callable(given) and (name == "features" or not isinstance(given, str)):
                 raise ValueError(
@@ -73,17 +74,17 @@ class Learner:
             )
         own_policy = None if policy is None or isinstance(policy, str) else policy
         self.settings: Settings = kept or settings_for(
-            env if isinstance(env, str) else environment_name(self.environment),
+            env if isinstance(env, str) else opening.environment_name(self.environment),
             policy=policy if own_policy is None else "other",
             features=None if features is None else "other",
-            environment=None if given_by_name(env) else "other",
+            environment=None if opening.given_by_name(env) else "other",
             schedule="other" if callable(schedule) else schedule,
             query="other" if callable(query) else query,
             task=task_of(self.environment, options.get("max_steps")),
             **options,
         )
         self.features = features
-        period = environment_attribute(self.environment, "observation_period")
+        period = opening.environment_attribute(self.environment, "observation_period")
         spaces = (self.environment.observation_space, self.environment.action_space)
         self.cycle = Cycle(
             self.settings,
@@ -133,7 +134,7 @@ class Learner:
             environment.observation_space,
             environment.action_space,
             action_scale=options.initial_action_scale,
-            period=environment_attribute(environment, "observation_period"),
+            period=opening.environment_attribute(environment, "observation_period"),
         )
 
     @property

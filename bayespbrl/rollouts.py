@@ -35,8 +35,6 @@ _COMPILER = {"xla_backend_optimization_level": 1}  # compiles faster, and what i
 # An episode as it runs: the state of the dynamics, which may be any pytree, the observation, and whether it goes on.
 Running = tuple[Any, Shaped[Array, "..."], Bool[Array, ""]]
 
-__all__ = ["Returns", "open_environment", "returns", "rollout", "step_limit"]
-
 
 @dataclass(frozen=True)
 class Returns:

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.spaces import Box
 
-from bayespbrl.rollouts import open_environment, returns, rollout
+from bayespbrl.envs.opening import open_environment
+from bayespbrl.rollouts import returns, rollout
 
 
 @jax.tree_util.register_dataclass

@@ -10,8 +10,8 @@ from toys import Push
 
 from bayespbrl.baselines import epmc, every_visit_preferences, pf, programming_by_feedback
 from bayespbrl.envs.gridworld import DYNAMICS, REWARDS, START
+from bayespbrl.envs.opening import open_environment
 from bayespbrl.experts import MarginExpert, ReturnExpert
-from bayespbrl.rollouts import open_environment
 from bayespbrl.studies import Study
 from bayespbrl.studies.baseline_trials import read_baseline
 from bayespbrl.studies.declaration import parsed

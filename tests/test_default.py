@@ -14,6 +14,7 @@ from toys import Slope, fingerprint
 
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert, cycle, rollouts
+from bayespbrl.envs import opening
 from bayespbrl.events import answered
 from bayespbrl.improvement.check import Check
 from bayespbrl.policies.actor import Actor
@@ -281,7 +282,7 @@ def test_a_stopped_run_of_the_default_goes_on_bit_for_bit(tmp_path):
     "env", ["swing-up", "Pendulum-v1", "CartPole-v1", pytest.param("acrobot", marks=pytest.mark.slow)]
 )
 def test_equal_starts_give_equal_first_states_and_other_actions(env):
-    environment = rollouts.open_environment(env)
+    environment = opening.open_environment(env)
     policy = Learner(env, seed=1).last_policy
     first, second = (
         rollout(environment, policy, key=jax.random.key(key), episodes=3, max_steps=5, starts=[7, 7, 8])

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from bayespbrl import diagnostics
 from bayespbrl.diagnostics import convergence, plot_convergence, plot_ranks
 from bayespbrl.diagnostics.plots import trials_figure
-from bayespbrl.rollouts import open_environment
+from bayespbrl.envs.opening import open_environment
 
 
 def tree_of(margins):

@@ -12,7 +12,7 @@ from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box, Discrete
 
 from bayespbrl import rollouts
-from bayespbrl.envs import functional
+from bayespbrl.envs import functional, opening
 from bayespbrl.rollouts import returns, rollout
 
 KEY = jax.random.key(5)
@@ -97,7 +97,7 @@ def rides():
 
 def test_a_trajectory_is_the_loop_over_the_pure_functions(rides):
     trajectory = rides[1]
-    dynamics = rollouts.open_environment("bicycle").unwrapped.dynamics
+    dynamics = opening.open_environment("bicycle").unwrapped.dynamics
     with jax.enable_x64(True):
         start_key, steps_key = jax.random.split(jax.random.split(KEY, 60)[1])
         state, observation = functional.reset(dynamics, start_key)

@@ -109,11 +109,11 @@ def action_values(better: Float[np.ndarray, "c a a"]) -> Float[np.ndarray, "c a"
     return 1 / (inverse.sum(axis=-1) - (actions - 2))  # Price et al. (1994)
 
 
-def exp3(gains: Float[np.ndarray, "c a"], exploration: float = EXPLORATION) -> Float[np.ndarray, "c a"]:
+def exp3(gains: Float[np.ndarray, "c a"]) -> Float[np.ndarray, "c a"]:
     """The probabilities of EXP3 (Auer et al. 1995): a share η uniform, the rest ∝ exp(η/A · gains)."""
     actions = gains.shape[1]
-    powers = exploration / actions * (gains - gains.max(axis=1, keepdims=True))
-    return exploration / actions + (1 - exploration) * np.exp(powers) / np.exp(powers).sum(axis=1, keepdims=True)
+    powers = EXPLORATION / actions * (gains - gains.max(axis=1, keepdims=True))
+    return EXPLORATION / actions + (1 - EXPLORATION) * np.exp(powers) / np.exp(powers).sum(axis=1, keepdims=True)
 
 
 def best_actions(better: Float[np.ndarray, "c a a"]) -> Float[np.ndarray, "c a"]:

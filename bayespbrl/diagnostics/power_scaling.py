@@ -17,17 +17,15 @@ COMPONENTS = ("prior", "likelihood")
 # Least standard deviation of a log density over the draws, in nats. Below it powers near 1 have no visible effect, and
 # ArviZ's estimate of the weights' tail divides by zero.
 LEAST_SPREAD = 1e-3
+THRESHOLD = 0.05  # a quantity counts as sensitive from here on (Kallioinen et al. 2024)
 
 
-def sensitivity(
-    tree: xr.DataTree, features: np.ndarray | None = None, *, threshold: float = 0.05, seed: int = 0
-) -> xr.Dataset:
+def sensitivity(tree: xr.DataTree, features: np.ndarray | None = None, *, seed: int = 0) -> xr.Dataset:
     """Power-scaling sensitivity of the margins, or of utilities wᵀφ, to σ and to the likelihood.
 
     Args:
       tree: what `sample_posterior` returned.
       features: φ(s) of states or feature sums ψ(τ), shape (n, D), in the units of the differences. None: the K margins.
-      threshold: a quantity counts as sensitive from here on.
       seed: of the prior draws in the directions that no answer constrains.
 
     Returns:
@@ -56,10 +54,10 @@ def sensitivity(
     return xr.Dataset(
         {
             "sensitivity": (("component", "quantity"), sensitivities),
-            "diagnosis": ("quantity", _diagnosis(sensitivities >= threshold)),
+            "diagnosis": ("quantity", _diagnosis(sensitivities >= THRESHOLD)),
         },
         coords={"component": list(COMPONENTS)},
-        attrs={"threshold": threshold},
+        attrs={"threshold": THRESHOLD},
     )
 
 

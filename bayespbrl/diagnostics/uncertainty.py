@@ -17,6 +17,7 @@ from scipy.stats import rankdata
 
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.diagnostics.estimates import expect_posterior
+from bayespbrl.figures import spread
 from bayespbrl.improvement.q_function import CriticData, estimate_q
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Trajectory, transitions
@@ -198,7 +199,7 @@ def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
     actions = greedy["action"].values
     columns = [int(np.flatnonzero(actions == action)[0]) for action in greedy["greedy_of_mean"].values]
     axes.plot(columns, np.arange(len(columns)), "o", color="tab:orange", markersize=3)
-    places = np.unique(np.linspace(0, len(actions) - 1, min(len(actions), 9)).round().astype(int))
+    places = spread(len(actions), 9)
     axes.set_xticks(places, [f"{actions[place]:g}" for place in places])
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return finished(axes, whole=False, xlabel="action", ylabel="state", title=_titled("Best action", greedy))

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from bayespbrl.figures import spread
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -38,7 +40,7 @@ def draw_film_strip(
       axes: matplotlib axes.
       step_seconds: duration of a step.
     """
-    shown = np.unique(np.linspace(0, len(states) - 1, MAX_POSES).round().astype(int))
+    shown = spread(len(states), MAX_POSES)
     for place, index in enumerate(shown):
         row, column = divmod(place, COLUMNS)
         offset = np.array([2.3 * column, -2.8 * row])

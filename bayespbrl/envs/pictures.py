@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
 from bayespbrl.checks import whole
 from bayespbrl.envs.functional import Drawn, picture
 from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, open_environment
+from bayespbrl.figures import spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,7 +60,7 @@ def frames(
     draw = environment_attribute(open_environment(environment), "draw")
     if draw is None:
         return picture(partial(draw_trajectory, environment, trajectory))[None]
-    shown = _spread(len(trajectory.states), max_frames)
+    shown = spread(len(trajectory.states), max_frames)
     return np.stack([picture(partial(draw, trajectory.states[index])) for index in shown])
 
 
@@ -96,7 +97,7 @@ def contact_sheet(
     frames: UInt8[np.ndarray, "f height width 3"], path: str | os.PathLike[str], *, most: int = 12, columns: int = 6
 ) -> Path:
     """Write at most `most` of the pictures, evenly spread, as one PNG, row by row."""
-    shown = frames[_spread(len(frames), most)]
+    shown = frames[spread(len(frames), most)]
     rows = -(-len(shown) // columns)
     height, width = shown.shape[1:3]
     sheet = np.full((rows * height, min(columns, len(shown)) * width, 3), 255, dtype=np.uint8)
@@ -105,8 +106,3 @@ def contact_sheet(
         sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = frame
     Image.fromarray(sheet).save(path, "PNG")
     return Path(path)
-
-
-def _spread(number: int, most: int) -> Int[np.ndarray, " f"]:
-    """At most `most` of the indices below `number`, evenly spread, first and last among them."""
-    return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(int))

@@ -47,9 +47,9 @@ class Convergence:
         """The smallest effective sample size; infinite where there is nothing to estimate."""
         return float(np.min(self.effective_sample_size, initial=np.inf))
 
-    def converged(self, *, rhat_max: float = RHAT_LIMIT, effective_sample_size_min: float = SIZE_LIMIT) -> bool:
+    def converged(self) -> bool:
         """Whether every quantity meets both limits; NaN meets none."""
-        return self.rhat_max <= rhat_max and self.effective_sample_size_min >= effective_sample_size_min
+        return self.rhat_max <= RHAT_LIMIT and self.effective_sample_size_min >= SIZE_LIMIT
 
 
 def chain_convergence(draws: ArrayLike) -> Convergence:

@@ -178,7 +178,7 @@ class WithLapses:
 
     Attributes:
       attentive: the likelihood p of an answer that is not given at random.
-      lapse_rate: λ in (0, 1).
+      lapse_rate: λ in [0, 1).
     """
 
     attentive: Likelihood

@@ -84,7 +84,6 @@ def flown(
     margins: Float[Array, " c"],
     violated: Float[Array, " a"],
     heights: Float[Array, "a n"],
-    duration: float = DURATION,
 ) -> tuple[Float[Array, " q"], Float[Array, " q"], Bool[Array, ""]]:
     """Position and velocity at the end of a flight, and whether it was given up.
 
@@ -94,7 +93,6 @@ def flown(
       margins: at the start.
       violated: answers of each answerer at the start.
       heights: log likelihood by the number of violated answers, for each answerer.
-      duration: in (0, π), radians.
     """
     number, squares = len(walls.normals), jnp.diagonal(walls.products)
     there, each = jnp.any(walls.relieved != 0, axis=1) & (squares > 0), jnp.arange(len(heights))
@@ -105,9 +103,9 @@ def flown(
         # two reductions, because the compiler makes a slow loop of argmax
         wall = jnp.min(jnp.where(cotangents == jnp.max(cotangents), jnp.arange(number), number - 1))
         angle = jnp.arctan2(1.0, cotangents[wall])
-        met = angle < duration - now.time
-        angle = jnp.where(met, angle, duration - now.time)
-        time = jnp.where(met, now.time + angle, duration)
+        met = angle < DURATION - now.time
+        angle = jnp.where(met, angle, DURATION - now.time)
+        time = jnp.where(met, now.time + angle, DURATION)
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         speed = now.speeds[wall] * cos - now.margins[wall] * sin
         beyond = now.violated - jnp.sign(speed) * walls.relieved[wall]
@@ -131,11 +129,11 @@ def flown(
     kicks = jnp.zeros((number, 2), y.dtype)
     start = _Flight(margins, walls.normals @ velocity, violated, jnp.zeros((), y.dtype), zero - 1, zero, kicks)
     most = MOST_EVENTS * number
-    end = lax.while_loop(lambda now: (now.time < duration) & (now.events < most), to_next_wall, start)
+    end = lax.while_loop(lambda now: (now.time < DURATION) & (now.events < most), to_next_wall, start)
     position, velocity = jnp.stack([y, velocity]) + end.kicks.T @ walls.normals
-    cos, sin = np.cos(duration), np.sin(duration)
+    cos, sin = np.cos(DURATION), np.sin(DURATION)
     # Pakman & Paninski (2014): the motion under a standard normal distribution is a rotation
-    return position * cos + velocity * sin, velocity * cos - position * sin, end.time < duration
+    return position * cos + velocity * sin, velocity * cos - position * sin, end.time < DURATION
 
 
 def flight_move(

@@ -13,12 +13,12 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
-from jaxtyping import Int
 from PIL import Image
 
 from bayespbrl.envs.functional import picture
 from bayespbrl.envs.opening import environment_attribute
 from bayespbrl.events import LearnerState
+from bayespbrl.figures import spread
 from bayespbrl.learner import Learner
 from bayespbrl.people.drawing import SIDE, draw_grid, draw_scenes, scene_of
 from bayespbrl.people.plots import draw_plots
@@ -115,11 +115,6 @@ class Clips:
             some = spread(len(trajectory.states), SLOW_FRAMES)
             return [Image.fromarray(picture(partial(draw, trajectory.states[index]))) for index in some]
         return None
-
-
-def spread(number: int, most: int) -> Int[np.ndarray, " f"]:
-    """At most `most` of the indices below `number`, evenly spread, first and last among them."""
-    return np.linspace(0, number - 1, min(number, most)).round().astype(int)
 
 
 def sheet_of(pictures: Sequence[Image.Image], trajectory: Trajectory) -> Clip:

@@ -1,7 +1,7 @@
 """Estimates with their intervals: medians, differences, answers needed, failed trials, performance profiles, p values.
 
 All intervals are 95 % intervals. Bootstrap intervals are percentile intervals (Efron & Tibshirani 1993) over the
-trials, from 10 000 resamples of a fixed stream, so that the same data give the same table.
+trials, from 10 000 resamples of a fixed stream (2000 of the profiles), so that the same data give the same table.
 """
 
 from collections.abc import Mapping, Sequence
@@ -75,21 +75,20 @@ def failed_trials(failed: int, trials: int) -> Interval:
     return Interval(failed / trials, float(bounds.low), float(bounds.high))
 
 
-def answers_for_good(answers: np.ndarray, values: np.ndarray, level: float, quantile: float = 0.5) -> Interval:
-    """Number of answers after which a quantile over the trials stays at or above `level`.
+def answers_for_good(answers: np.ndarray, values: np.ndarray, level: float) -> Interval:
+    """Number of answers after which the median over the trials stays at or above `level`.
 
     Args:
       answers: numbers of answers, shape (n,), increasing.
       values: of each trial's last policy with no more answers, shape (S, n).
       level: of the value.
-      quantile: over the trials; 0.5 is the median.
 
     Returns:
-      infinity where the quantile is below `level` at the end, as bounds too.
+      infinity where the median is below `level` at the end, as bounds too.
     """
 
     def needed(values: np.ndarray) -> np.ndarray:
-        reached = np.quantile(values, quantile, axis=-2) >= level
+        reached = np.median(values, axis=-2) >= level
         for_good = np.flip(np.logical_and.accumulate(np.flip(reached, -1), axis=-1), -1)
         return np.where(for_good[..., -1], answers[for_good.argmax(axis=-1)], np.inf)
 

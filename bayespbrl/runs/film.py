@@ -15,7 +15,7 @@ from bayespbrl.policies.actor import Actor
 FRAMES = 60  # pictures in the GIF of a drawn episode; where the environment renders itself, at most twice as many
 
 
-def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tuple[Path, Path]:
+def film_policy(learner: Learner, directory: Path) -> tuple[Path, Path]:
     """Write the film and the film strip of one episode under the learner's policy: `final.gif` and `final.png`.
 
     An environment whose dynamics have a method `draw` is drawn. Any other one renders itself in its mode `rgb_array`.
@@ -26,7 +26,7 @@ def film_policy(learner: Learner, directory: Path, *, name: str = "final") -> tu
     Raises:
       ValueError: an environment that cannot be rendered, or that fails while it is.
     """
-    film, strip = directory / f"{name}.gif", directory / f"{name}.png"
+    film, strip = directory / "final.gif", directory / "final.png"
     environment, settings = learner.environment, learner.settings
     # another number than the learner's would need a new compilation
     update, number = settings.update, settings.rollouts.trajectories_per_iteration

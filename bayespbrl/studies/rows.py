@@ -9,9 +9,8 @@ from typing import Any
 import xarray as xr
 
 from bayespbrl import checks, runs
-from bayespbrl.envs.opening import environment_name
+from bayespbrl.envs.opening import environment_name, open_environment
 from bayespbrl.learner import Learner, task_of
-from bayespbrl.rollouts import open_environment
 from bayespbrl.runs.directory import RunDirectory, read_summary
 from bayespbrl.runs.simulated import SIMULATED, expert_of
 from bayespbrl.settings import Settings, settings_for

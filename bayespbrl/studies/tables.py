@@ -18,6 +18,7 @@ from bayespbrl.runs.files import write_file, write_netcdf
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value", "value_newest")
 
 BALANCING_FILE = "balancing.json"
+BALANCING_EPISODES = 100
 FIRST_POLICY_FILE = "first-policy.json"  # of a trial that does not learn: the random policy
 
 
@@ -89,15 +90,17 @@ def _figures(values: Sequence[Sequence[Any]]) -> np.ndarray | None:
     return np.array([[missing if value is None else value for value in row] for row in values])
 
 
-def measure_balancing(learner: Learner, directory: Path, *, max_steps: int, episodes: int = 100) -> None:
+def measure_balancing(learner: Learner, directory: Path, *, max_steps: int) -> None:
     """Measure the steps of a learner's final policy before a terminal state, over fresh episodes; in `balancing.json`.
 
     An episode that reaches `max_steps` counts as that many.
     """
     key = jax.random.key(learner.settings.seed)
-    lasted = rollouts.returns(learner.environment, learner.policy, key=key, episodes=episodes, max_steps=max_steps)
+    lasted = rollouts.returns(
+        learner.environment, learner.policy, key=key, episodes=BALANCING_EPISODES, max_steps=max_steps
+    )
     content = {
-        "episodes": episodes,
+        "episodes": BALANCING_EPISODES,
         "max_steps": max_steps,
         "mean_steps": float(lasted.steps.mean()),
         "terminated": float(lasted.terminated.mean()),

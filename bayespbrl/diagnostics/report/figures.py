@@ -37,18 +37,18 @@ def plot_progress(table: xr.Dataset, axes: Axes) -> Axes:
     return finished(axes, xlabel="iteration", ylabel="utility relative to the last")
 
 
-def plot_rhat(table: xr.Dataset, axes: Axes, *, limit: float = RHAT_LIMIT) -> Axes:
+def plot_rhat(table: xr.Dataset, axes: Axes) -> Axes:
     """Largest R̂ of each iteration's fit."""
     _series(table, axes, {"rhat_max": "largest R̂"}, converged="utility_converged")
-    axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")
+    axes.axhline(RHAT_LIMIT, color="0.4", linestyle="--", linewidth=1, label=f"limit {RHAT_LIMIT:g}")
     low, high = axes.get_ylim()
-    return finished(axes, ylabel="R̂", ylim=(min(low, 0.9995), max(high, limit + 0.002)))
+    return finished(axes, ylabel="R̂", ylim=(min(low, 0.9995), max(high, RHAT_LIMIT + 0.002)))
 
 
-def plot_effective_sample_size(table: xr.Dataset, axes: Axes, *, limit: float = SIZE_LIMIT) -> Axes:
+def plot_effective_sample_size(table: xr.Dataset, axes: Axes) -> Axes:
     """Effective sample size of the worst margin of each iteration's fit."""
     _series(table, axes, {"effective_sample_size_min": "worst margin"}, converged="utility_converged")
-    axes.axhline(limit, color="0.4", linestyle="--", linewidth=1, label=f"limit {limit:g}")
+    axes.axhline(SIZE_LIMIT, color="0.4", linestyle="--", linewidth=1, label=f"limit {SIZE_LIMIT:g}")
     return finished(axes, ylabel="effective sample size", ylim=(0, None))
 
 

@@ -100,7 +100,7 @@ def prequential_table(contents: RunContents) -> xr.Dataset:
     return score_predictions(np.clip(predicted, 0, 1), observed)
 
 
-def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
+def utility_table(contents: RunContents) -> xr.Dataset:
     """The utility over the state space.
 
     Returns:
@@ -123,7 +123,7 @@ def utility_table(contents: RunContents, *, seed: int = 0) -> xr.Dataset:
     if estimate is None or estimate.features is None:
         raise ValueError("utility: expected an estimate of the utility of states, got none")
     states = np.concatenate([trajectory.states for trajectory in contents.trajectories.values()])
-    shown, attrs = _states_to_show(contents, states, np.random.default_rng(seed))
+    shown, attrs = _states_to_show(contents, states, np.random.default_rng(0))
     lengths = np.linalg.norm(estimate.features(shown), axis=1)
     data: Variables = {"used": ("state", estimate.utilities(shown))}
     data["reached"] = ("state", lengths > 0.01 * np.max(lengths, initial=0.0))
