@@ -4,12 +4,11 @@
     python benchmarks/results_page.py --check    # compares its text, and runs one cell of each study again
 
 The text is `benchmarks/RESULTS.md.jinja`; the tables are of the studies in `benchmarks/studies` (the four data files of
-each, as `bayespbrl study` and `bayespbrl results` leave them) and of the earlier ones in `benchmarks/results`.
+each, as `bayespbrl study` and `bayespbrl results` leave them).
 """
 
 import argparse
 import difflib
-import re
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -23,10 +22,9 @@ import numpy as np
 import pandas as pd
 
 from bayespbrl.results.figures import curves_figure, profiles_figure
-from bayespbrl.results.intervals import failed_trials, median_interval
 from bayespbrl.results.study_data import RowData, StudyData, read_study
 from bayespbrl.results.tables import MISSING, markdown
-from bayespbrl.results.write import section, tables_of
+from bayespbrl.results.write import NOTES, columns_of, tables_of, titled
 from bayespbrl.runs.directory import read_summary
 from bayespbrl.studies.baseline_trials import read_baseline
 from bayespbrl.studies.declaration import declared
@@ -36,9 +34,7 @@ from bayespbrl.studies.rows import row_of, run_trial
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "RESULTS.md"
-STUDIES, EARLIER, PUBLISHED = HERE / "studies", HERE / "results", HERE / "published"
-# A trial that ends below has failed, in the earlier studies.
-EARLIER_FAILED = {"swing-up": -1300.0, "gridworld": 0.99 * 294.8125}
+STUDIES, PUBLISHED = HERE / "studies", HERE / "published"
 TOLERANCE = 1e-5  # relative: the data have six digits
 EXACT_ITERATIONS = 2  # of a cell that is run again on another machine; rounding does not show there yet
 
@@ -56,7 +52,8 @@ def page(studies: dict[str, StudyData]) -> str:
             title = declared(name).title
             return f"**Not run yet.** `bayespbrl study {name}`: {title}. `--dry-run` says how long it takes."
         found = tables_of(studies[name])
-        return "\n\n".join(section(studies[name], kind, found[kind]) for kind in kinds if kind in found)
+        shown = [titled(studies[name], kind, found[kind]) for kind in kinds if kind in found]
+        return "\n\n".join([studies[name].source, *shown])
 
     def figures(name: str) -> str:
         made = [kind for kind, make in FIGURES.items() if name in studies and make(studies[name]) is not None]
@@ -67,7 +64,7 @@ def page(studies: dict[str, StudyData]) -> str:
 
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     template = environment.from_string((HERE / "RESULTS.md.jinja").read_text())
-    return template.render(tables=tables, figures=figures, beside=beside, earlier=earlier)
+    return template.render(tables=tables, figures=figures, beside=beside, columns=columns_of(NOTES))
 
 
 FIGURES = {"curves": curves_figure, "profiles": profiles_figure}
@@ -90,32 +87,6 @@ def published(data: StudyData, task: str, file: str, unit: float) -> str:
 
 def _quartiles(low: float, middle: float, high: float) -> str:
     return f"{middle:.3f} [{low:.3f} … {high:.3f}]"
-
-
-def earlier(task: str) -> str:
-    """The earlier studies of a task, from their files: options, and the value at the end."""
-    index = (EARLIER / "README.md").read_text()
-    named = re.findall(rf"^\| \[({re.escape(task)}[^\]]*\.csv)\]\([^)]*\) \| (.*?) \|$", index, flags=re.MULTILINE)
-    lines = []
-    for file, options in named:
-        trials = pd.read_csv(EARLIER / file).sort_values(["seed", "iteration"]).groupby("seed").last()
-        values = trials["value"].to_numpy()
-        middle, low, high = median_interval(values)
-        line = {
-            "file": f"[{file.removesuffix('.csv')}](benchmarks/results/{file})",
-            "options": options,
-            "trials": str(len(values)),
-            "answers": f"{trials['answers'].median():g}",
-            "median": f"{middle:.4g}",
-            "interval of the median": f"[{low:.4g}, {high:.4g}]",
-            "quartiles": " … ".join(f"{value:.4g}" for value in np.quantile(values, [0.25, 0.75])),
-        }
-        if task in EARLIER_FAILED:
-            failed = int((values < EARLIER_FAILED[task]).sum())
-            bounds = failed_trials(failed, len(values))
-            line["failed"] = f"{failed} of {len(values)} [{bounds.low:.2f}, {bounds.high:.2f}]"
-        lines.append(line)
-    return markdown(pd.DataFrame(lines))
 
 
 def write_figures(studies: dict[str, StudyData]) -> None:

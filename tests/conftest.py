@@ -97,8 +97,9 @@ threadpool_limits(1)  # here, where NumPy has its threads already
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # in what tests start
 # Nor does XLA share its loops over small vectors among threads: that took half as much CPU time again.
 os.environ["PJRT_NPROC"] = "1"
-# All of them, and the next session, share what JAX has compiled. A file that was cut short is compiled again.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
+# All of them, later sessions and other checkouts share what JAX has compiled. A file cut short is compiled again.
+HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(HOME / "bayespbrl" / "tests"))
 os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
 os.environ["PYTHONWARNINGS"] = "ignore:Error reading persistent compilation cache entry"
 # Compilation is most of the work of a first session: the older of two generators of code takes half as long. XLA ends

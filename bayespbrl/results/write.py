@@ -1,5 +1,6 @@
 """`bayespbrl results`: the tables of a study in Markdown and CSV, and its figures, beside its data."""
 
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -30,6 +31,29 @@ TITLES = {
     "runs": "Settings, convergence and updates of the runs",
 }
 
+NOTES = {
+    "values": "value of the kept policy at the end of a trial, and after so many answers, median [lower quartile]. "
+    "Relative value: 0 is the random policy, 1 the median of the reference runs on the hidden reward. Difference: "
+    "median paired difference to the first row of the task, after as many answers as all trials of both gave; p values "
+    "(Wilcoxon) are adjusted for the comparisons of the table by Holm, and by Benjamini and Hochberg (false "
+    "discovery). Brackets elsewhere: 95 % intervals, bootstrap over trials, of failed trials exact (Clopper and "
+    "Pearson).",
+    "kept": "value, median [lower quartile], of the policy that a run keeps, of its newest, and of the best of the "
+    "run, which only the hidden reward knows. Within 3 % of the best: of what that gains over the random policy.",
+    "pairs": "pairs of the same seed, with the first row of the task: in how many the trial needed fewer answers, and "
+    "more; in all, until its kept policy is better than the value, and until it stays so. p: two-sided sign tests, not "
+    "adjusted for their number.",
+    "calibration": "each answer was predicted before it was given. `z` below −2: overconfident, above 2: "
+    "underconfident. ECE: expected calibration error, and that of calibrated predictions, by chance.",
+    "runs": "fits: posteriors over all trials and iterations. ESS: effective sample size of the worst margin. Signal, "
+    "KL: medians over updates.",
+}  # what the columns of a table mean
+
+
+def columns_of(names: Iterable[str]) -> str:
+    """What the columns of these tables mean, an item each."""
+    return "\n".join(f"- **{TITLES[name]}**: {NOTES[name]}" for name in names)
+
 
 def refreshed(directory: Path) -> StudyData:
     """The data of a study, first rewritten from its run directories where this version made them."""
@@ -57,29 +81,11 @@ def tables_of(data: StudyData) -> dict[str, pd.DataFrame]:
     return {name: table for name, table in tables.items() if len(table)}
 
 
-def section(data: StudyData, name: str, table: pd.DataFrame) -> str:
-    """A table in Markdown, with its source and the meaning of its columns."""
-    notes = {
-        "values": f"Value of the kept policy at the end of a trial. Relative value: 0 is the random policy, 1 the "
-        f"median of the reference runs on the hidden reward. Differences: median paired difference to the first row of "
-        f"the task after as many answers as all trials of both gave; p values of {_compared(table)} comparisons "
-        f"(Wilcoxon), adjusted by Holm and by Benjamini and Hochberg. Brackets: 95 % intervals, bootstrap over trials; "
-        f"of failed trials exact (Clopper and Pearson). For good: and never below again.",
-        "kept": "Value, median [lower quartile], of the policy that a run keeps, of its newest, and of the best of the "
-        "run, which only the hidden reward knows. Within 3 % of the best: of what that gains over the random policy.",
-        "pairs": "Pairs of the same seed, with the first row of the task: in how many the trial needed fewer answers, "
-        "and more; in all, until its kept policy is better than the value, and until it stays so. p: two-sided sign "
-        "tests, not adjusted for their number.",
-        "calibration": "Each answer was predicted before it was given. `z` below −2: overconfident, above 2: "
-        "underconfident. ECE: expected calibration error, and that of calibrated predictions, by chance.",
-        "runs": "Fits: posteriors over all trials and iterations. ESS: effective sample size of the worst margin. "
-        "Signal, KL: medians over updates.",
-    }
-    return f"{markdown(table)}\n\n{data.source} {notes[name]}"
-
-
-def _compared(table: pd.DataFrame) -> int:
-    return int((table["p (Holm)"] != MISSING).sum()) if "p (Holm)" in table else 0
+def titled(data: StudyData, name: str, table: pd.DataFrame) -> str:
+    """A table in Markdown under its title, with the number of its comparisons."""
+    compared = int((table["p (Holm)"] != MISSING).sum()) if "p (Holm)" in table else 0
+    number = {0: "", 1: "; one comparison"}.get(compared, f"; p values adjusted for {compared} comparisons")
+    return f"**{TITLES[name]}** (study `{data.name}`{number})\n\n{markdown(table)}"
 
 
 def write_results(directory: Path | str, out: Path | str | None = None) -> list[Path]:
@@ -98,11 +104,13 @@ def write_results(directory: Path | str, out: Path | str | None = None) -> list[
     data = refreshed(Path(directory))
     out = Path(directory if out is None else out)
     out.mkdir(parents=True, exist_ok=True)
-    written, sections = [], [f"# {data.declaration.title}"]
-    for name, table in tables_of(data).items():
+    written, tables = [], tables_of(data)
+    sections = [f"# {data.declaration.title}", data.source]
+    for name, table in tables.items():
         written.append(out / f"{name}.csv")
         write_file(written[-1], table.to_csv(index=False, lineterminator="\n"))
-        sections += [f"## {TITLES[name]}", section(data, name, table)]
+        sections.append(titled(data, name, table))
+    sections.append(columns_of(tables))
     for name, figure in (("curves", curves_figure(data)), ("profiles", profiles_figure(data))):
         if figure is not None:
             written.append(out / f"{name}.png")
