@@ -104,7 +104,7 @@ def test_the_values_table_is_that_of_hand_made_trials(made):
 def test_the_page_names_study_command_version_date_and_machine_and_counts_comparisons(made, tmp_path):
     page, *files = write_results(made, tmp_path / "out")
     text = page.read_text()
-    for part in ("Study `made`", "bayespbrl study made", "version 0.0", "2026-01-01", "a machine", "of 2 comparisons"):
+    for part in ("Study `made`", "bayespbrl study made", "version 0.0", "2026-01-01", "a machine", "for 2 comparisons"):
         assert part in text
     assert "| gridworld | first | the default | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
     assert {file.name for file in files} == {"values.csv", "runs.csv", "curves.png", "profiles.png"}
