@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium
@@ -11,6 +12,7 @@ from bayespbrl import events, queries, rollouts
 from bayespbrl.cycle import Cycle
 from bayespbrl.envs import opening
 from bayespbrl.envs.opening import AnyEnvironment
+from bayespbrl.envs.stepping import random_steps
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
@@ -330,7 +332,8 @@ class Learner:
 def task_of(environment: gymnasium.Env, max_steps: int | None = None) -> Task:
     """The properties of a task that the default preset depends on; `ValueError` where no time limit is known."""
     horizon = rollouts.step_limit(environment, max_steps)
-    return Task(environment.observation_space, environment.action_space, horizon)
+    steps_at_first = partial(random_steps, environment)
+    return Task(environment.observation_space, environment.action_space, horizon, steps_at_first)
 
 
 Choice = TypeVar("Choice")

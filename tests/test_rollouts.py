@@ -10,9 +10,13 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box, Discrete
+from toys import Push
 
+import bayespbrl
 from bayespbrl import rollouts
 from bayespbrl.envs import functional, opening
+from bayespbrl.envs.opening import open_environment
+from bayespbrl.envs.stepping import random_steps
 from bayespbrl.rollouts import returns, rollout
 
 KEY = jax.random.key(5)
@@ -368,3 +372,16 @@ def test_bad_arguments_are_named(run, options, message):
 )
 def test_the_time_limit_is_the_environments_own(environment, limit):
     assert rollouts.step_limit(environment) == limit
+
+
+def test_the_first_steps_of_random_actions_are_counted_up_to_a_limit_the_same_at_every_call():
+    assert [random_steps(open_environment(Push(steps)), 6) for steps in (1, 4, 9)] == [1.0, 4.0, 6.0]
+    cart = open_environment("CartPole-v1")
+    assert random_steps(cart, 40) == random_steps(cart, 40) < 40
+    cart.reset(seed=0)  # still open
+
+
+def test_a_learner_of_episodes_that_end_at_once_collects_more_of_them():
+    learner = bayespbrl.Learner(Push(5, ends=True), max_steps=60)
+    assert learner.settings.rollouts.trajectories_per_iteration == 80
+    assert bayespbrl.Learner(Push(50), max_steps=60).settings.rollouts.trajectories_per_iteration == 10

@@ -1,6 +1,7 @@
 """Settings: every bad value is refused with its name, what was expected and what came."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -151,6 +152,25 @@ def test_the_default_derives_from_spaces_and_horizon_what_tasks_differ_in():
     assert derived(Task(Box(-1.0, 1.0, (4,)), Discrete(2), horizon=500)) == (0.992, 1, 1.0)
     assert derived(Task(Box(-1.0, 1.0, (17,)), Box(-1.0, 1.0, (6,)), horizon=1000)) == (0.995, None, 2.0)
     assert settings_for("SomebodysEnv-v3", task=TASK, discount=0.9).critic.discount == 0.9
+
+
+@pytest.mark.parametrize(
+    ("steps", "task", "options", "number"),
+    [
+        (40, {}, {}, 10),
+        (39.5, {}, {}, 11),
+        (8, {}, {}, 50),
+        (1, {}, {}, 100),
+        (8, {"action_space": Discrete(2)}, {}, 20),
+        (8, {"horizon": 40}, {}, 10),  # no longer than that if nothing ends it
+        (8, {}, {"trajectories_per_iteration": 12}, 12),
+        (8, {}, {"preset": "paper"}, 10),
+    ],
+)
+def test_where_episodes_end_at_once_an_iteration_takes_more_of_them(steps, task, options, number):
+    task = replace(TASK, steps_at_first=lambda most: min(steps, most), **task)
+    assert settings_for("SomebodysEnv-v3", task=task, **options).rollouts.trajectories_per_iteration == number
+    assert settings_for("swing-up", task=task).rollouts.trajectories_per_iteration == 10  # its own
 
 
 def test_iterations_follow_from_the_budget_of_answers():

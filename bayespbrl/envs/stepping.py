@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike
 from bayespbrl.envs.opening import environment_name, flattened, made_from
 
 MAX_LANES = 128  # copies of an environment stepped side by side
+PROBES = 10  # episodes of random actions
 Rows = Shaped[np.ndarray, "n ..."]
 Episode = tuple[Rows, Rows, Float[np.ndarray, " t"], bool]
 
@@ -53,6 +55,22 @@ def episodes_by_interface(
             yield from vector_episodes[: episodes - first]
     finally:
         vector.close()
+
+
+def random_steps(env: gymnasium.Env, most: int) -> float:
+    """Mean number of steps of a few episodes of random actions, each cut after `most`; the same at every call.
+
+    Raises:
+      ValueError: as `episodes_by_interface`.
+    """
+    space = deepcopy(env.action_space)
+    space.seed(0)
+
+    def act(_: int, observations: Rows) -> Rows:
+        return np.stack([np.asarray(space.sample()) for _ in observations])
+
+    drawn = episodes_by_interface(env, act, seeds=0, episodes=PROBES, steps=most)
+    return float(np.mean([len(actions) for _, actions, _, _ in drawn]))
 
 
 class _Borrowed(gymnasium.Wrapper):

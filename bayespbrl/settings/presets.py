@@ -4,7 +4,8 @@
 paper's protocol.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,6 +111,8 @@ DEFAULT: dict[str, Any] = {
     "fixed_point_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
     "projection_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
 }
+# Of an iteration's trajectories at first, and the most trajectories that it takes for them.
+LEAST_STEPS, MOST_TRAJECTORIES = 400, 100
 # Where people answer.
 PEOPLE: dict[str, Any] = {
     "repeats": 0.1,  # a simulated expert would only repeat itself
@@ -126,11 +129,13 @@ class Task:
     Attributes:
       observation_space, action_space: of the environment.
       horizon: its time limit, in steps.
+      steps_at_first: how many steps an episode of random actions takes, cut after the given number; None: not measured.
     """
 
     observation_space: Space[Any]
     action_space: Space[Any]
     horizon: int
+    steps_at_first: Callable[[int], float] | None = None
 
     def derived(self, *, people: bool) -> dict[str, Any]:
         """Options by spaces and horizon, and by whether people answer (they wait).
@@ -153,6 +158,20 @@ class Task:
             "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
         }
 
+    def more_trajectories(self) -> dict[str, Any]:
+        """More trajectories an iteration where the first episodes of a task with continuous actions end at once.
+
+        Decision: as many as have `LEAST_STEPS` steps, but at most `MOST_TRAJECTORIES`; with ten of four steps each,
+        InvertedPendulum is not learned.
+        """
+        if self.steps_at_first is None or not isinstance(self.action_space, Box):
+            return {}
+        usual: int = self.derived(people=False)["trajectories_per_iteration"]
+        enough = LEAST_STEPS // usual
+        steps = self.steps_at_first(enough) if enough < self.horizon else enough
+        wanted = math.ceil(LEAST_STEPS / steps)
+        return {"trajectories_per_iteration": min(max(usual, wanted), MOST_TRAJECTORIES)} if steps < enough else {}
+
 
 def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None) -> dict[str, Any]:
     """The options of the preset that `chosen` names, for an environment.
@@ -169,7 +188,10 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     if checks.one_of("preset", chosen.get("preset", "default"), NAMES) == "paper":
         return {"hyperparameters": "given"} | PAPER.get(name, {})
     people = chosen.get("expert", "return") not in SIMULATED
-    options = DEFAULT | ({} if task is None else task.derived(people=people)) | TASKS.get(name, {})
+    known = TASKS.get(name, {})
+    options = DEFAULT | ({} if task is None else task.derived(people=people)) | known
+    if task is not None and "trajectories_per_iteration" not in {*known, *chosen}:
+        options |= task.more_trajectories()
     if people:
         options |= PEOPLE
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":
