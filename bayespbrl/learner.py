@@ -24,6 +24,8 @@ from bayespbrl.utility.estimate import UtilityEstimate
 if TYPE_CHECKING:
     from bayespbrl.people.widget import ComparisonWidget
 
+VAIN_UNDOS = 10  # in a row: a person may press the key twice, a function would go on for ever
+
 
 class Learner:
     """Learns a policy from answers to "which of these two trajectories is better?".
@@ -253,12 +255,16 @@ class Learner:
         if not callable(expert):
             raise ValueError(f"expert: expected a function of two trajectories, got {expert!r}")
         self._advance(progress)
+        vain = 0
         while (query := self._question_for(answerer, progress)) is not None:
             began = time.perf_counter()
             answer = parse_answer(expert(*query.trajectories))
             seconds = None if answerer is None else time.perf_counter() - began
-            if answer is Answer.UNDO and self.state.previous is None:
-                continue  # nothing to take back: the same question again
+            vain = vain + 1 if answer is Answer.UNDO and self.state.previous is None else 0
+            if vain == VAIN_UNDOS:
+                raise ValueError(f"expert: expected an answer, because there is none to take back, got {vain} undos")
+            if vain:
+                continue  # the same question again
             self._take_in([query], [answer], answerer, seconds)
             self._advance(progress)
         return self

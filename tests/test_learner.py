@@ -388,6 +388,14 @@ def test_nothing_can_be_undone_before_the_first_answer():
     assert run.run(lambda first, second: next(replies)).preferences.answers == 4
 
 
+def test_an_expert_who_only_undoes_is_refused():
+    asked = []
+    with pytest.raises(
+        ValueError, match="expert: expected an answer, because there is none to take back, got 10 undos"
+    ):
+        learner().run(lambda first, second: asked.append(1) or "undo" if len(asked) < 100 else "tie")
+
+
 def test_another_answer_after_undoing_leads_elsewhere():
     run = learner()
     run.ask()
