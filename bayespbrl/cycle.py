@@ -23,7 +23,7 @@ from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, state
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.models.blas import one_blas_thread
-from bayespbrl.policies import greedy
+from bayespbrl.policies import Sampler, greedy
 from bayespbrl.preferences import opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
 from bayespbrl.settings import Settings
@@ -123,7 +123,7 @@ class Cycle:
         }
         return _entry(event, trajectories=collected)
 
-    def _tried(self, policy: Any) -> tuple[Trajectory, ...]:
+    def _tried(self, policy: Sampler) -> tuple[Trajectory, ...]:
         """Trajectories without the policy's noise, from starts that are the same for all policies of the run."""
         if not self.settings.update.checked:
             return ()
@@ -236,7 +236,7 @@ class Cycle:
             estimate=utility,
         )
 
-    def evaluated(self, policy: Any) -> rollouts.Returns:
+    def evaluated(self, policy: Sampler) -> rollouts.Returns:
         """Fresh episodes, the same for all policies of the run; the learner never sees them."""
         options = self.settings.rollouts
         return rollouts.returns(

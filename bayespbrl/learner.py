@@ -14,7 +14,7 @@ from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
-from bayespbrl.policies import Policy, greedy
+from bayespbrl.policies import Policy, Sampler, greedy
 from bayespbrl.policies.choice import initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
 from bayespbrl.settings import Settings, Task, settings_for
@@ -112,7 +112,7 @@ class Learner:
         return self.state.finished(self.settings)
 
     @property
-    def policy(self) -> Any:
+    def policy(self) -> Sampler:
         """The best policy by the posterior, without its noise; the newest, with it, where updates are not checked.
 
         One that was started anew replaces the policy before it only where it is clearly better.

@@ -245,7 +245,7 @@ class Settings:
         return self.critic.discount if given is None else given
 
 
-PARTS: dict[str, Any] = {
+PARTS: dict[str, type[Any]] = {
     "model": PreferenceModel,
     "estimation": Estimation,
     "features": Features,
