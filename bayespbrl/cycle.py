@@ -23,7 +23,7 @@ from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, state
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.models.blas import one_blas_thread
-from bayespbrl.policies import greedy
+from bayespbrl.policies import Sampler, greedy
 from bayespbrl.preferences import opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
 from bayespbrl.settings import Settings
@@ -91,10 +91,11 @@ class Cycle:
 
     def _newcomers(self, state: LearnerState) -> list[int]:
         """The candidates that no open question compares with their opponents."""
-        taken, last = [{query.first, query.second} for query in state.open], state.preferences.undominated[-1:]
-        newcomers = {query.newcomer for query in state.open}
-        pairs = {number: {number, state.opponents.get(number, *last)} for number in state.candidates}
-        return [number for number, pair in pairs.items() if number not in newcomers and pair not in taken]
+        taken, standing = [{query.first, query.second} for query in state.open], state.preferences.undominated
+        # an opponent of this iteration that is now undominated would compete with itself
+        left = set(state.candidates).difference(standing, (query.newcomer for query in state.open))
+        pairs = {number: {number, state.opponents.get(number, *standing[-1:])} for number in state.candidates}
+        return [number for number, pair in pairs.items() if number in left and pair not in taken]
 
     def collect(self, state: LearnerState) -> Entry:
         """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
@@ -122,7 +123,7 @@ class Cycle:
         }
         return _entry(event, trajectories=collected)
 
-    def _tried(self, policy: Any) -> tuple[Trajectory, ...]:
+    def _tried(self, policy: Sampler) -> tuple[Trajectory, ...]:
         """Trajectories without the policy's noise, from starts that are the same for all policies of the run."""
         if not self.settings.update.checked:
             return ()
@@ -149,14 +150,14 @@ class Cycle:
         favourite = state.best if state.restart is None else min(state.restart.number, state.started - 1)
         new, best = range(len(state.trajectories), len(known)), self._of_iteration(favourite)
         opponents = opponents_from_the_same_start(known, state.preferences, best) if options.same_start else {}
-        if state.estimate is None:
+        standing = state.preferences.undominated
+        if state.estimate is None or not standing:  # none: all were skipped
             return questions.first_questions(new, opponents, options, rng=rng)
         signal = None if state.bound is None else state.bound.signal
         if options.skips(state.preferences, state.unasked, state.estimate, signal):
             return questions.Chosen()
-        incumbent = state.preferences.undominated[-1]
-        situation = QuerySituation(new, known, state.shown, incumbent, state.estimate, signal, rng, opponents)
-        return questions.later_questions(self.query_rule, situation, options, answers=state.preferences.answers)
+        given = QuerySituation(new, known, state.shown, standing[-1], state.estimate, signal, rng, opponents, standing)
+        return questions.later_questions(self.query_rule, given, options, answers=state.preferences.answers)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""
@@ -235,7 +236,7 @@ class Cycle:
             estimate=utility,
         )
 
-    def evaluated(self, policy: Any) -> rollouts.Returns:
+    def evaluated(self, policy: Sampler) -> rollouts.Returns:
         """Fresh episodes, the same for all policies of the run; the learner never sees them."""
         options = self.settings.rollouts
         return rollouts.returns(

@@ -7,6 +7,7 @@ must depend on the two trajectories only: a resumed run may ask a question again
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Protocol
 
@@ -18,6 +19,8 @@ from bayespbrl.preferences import Answer, parse_answer
 from bayespbrl.trajectories import Trajectory
 
 TIE_TOLERANCE = 1e-9  # relative: rounding in another order of summation must not decide
+# Ends of the seeds, so that one expert within another with the same seed errs independently. `NoisyExpert` has none.
+TEACHER, MARGIN = 1, 2
 
 
 class Expert(Protocol):
@@ -50,6 +53,8 @@ class NoisyExpert:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if not callable(self.expert):
+            raise ValueError(f"expert: expected a function of two trajectories, got {self.expert!r}")
         checks.share("wrong_answers", self.wrong_answers)
         checks.whole("seed", self.seed, 0)
 
@@ -88,11 +93,11 @@ class Teacher:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not (np.isreal(self.rationality) and self.rationality > 0):
+        if not (isinstance(self.rationality, Real) and self.rationality > 0):
             raise ValueError(f"rationality: expected a number > 0, infinity included, got {self.rationality!r}")
         if checks.share("discount", self.discount) == 0:
             raise ValueError(f"discount: expected a number in (0, 1], got {self.discount!r}")
-        if not np.isreal(self.least_return) or np.isnan(self.least_return):
+        if not isinstance(self.least_return, Real) or np.isnan(self.least_return):
             raise ValueError(f"least_return: expected a number, got {self.least_return!r}")
         checks.non_negative("equal_within", self.equal_within)
         checks.share("mistakes", self.mistakes)
@@ -110,7 +115,7 @@ class Teacher:
         wrong = 0.0 if np.isinf(self.rationality) else expit(-self.rationality * abs(seen[0] - seen[1]))
         # wrong either by chance or by mistake; both at once are right
         wrong = wrong * (1 - self.mistakes) + (1 - wrong) * self.mistakes
-        return _reversed(answer) if _chance(self.seed, first, second) < wrong else answer
+        return _reversed(answer) if _chance(self.seed, first, second, TEACHER) < wrong else answer
 
 
 @dataclass(frozen=True)
@@ -144,7 +149,7 @@ class MarginExpert:
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
         answer = _preferred(first.total_reward, second.total_reward)
         wrong = self.error_probability(first.total_reward - second.total_reward)
-        return _reversed(answer) if _chance(self.seed, first, second) < wrong else answer
+        return _reversed(answer) if _chance(self.seed, first, second, MARGIN) < wrong else answer
 
 
 def _preferred(first: float, second: float) -> Answer:
@@ -159,10 +164,10 @@ def _reversed(answer: Answer) -> Answer:
     return {Answer.FIRST: Answer.SECOND, Answer.SECOND: Answer.FIRST}.get(answer, answer)
 
 
-def _chance(seed: int, first: Trajectory, second: Trajectory) -> float:
-    """A uniform number in [0, 1), the same for the same two trajectories in either order."""
+def _chance(seed: int, first: Trajectory, second: Trajectory, *stream: int) -> float:
+    """A uniform number in [0, 1), the same for the same two trajectories in either order; each stream has its own."""
     marks = sorted(zlib.crc32(t.actions.tobytes(), zlib.crc32(t.states.tobytes())) for t in (first, second))
-    return float(np.random.default_rng([seed, *marks]).random())
+    return float(np.random.default_rng([seed, *marks, *stream]).random())
 
 
 def _discounted_from_the_end(rewards: np.ndarray, discount: float) -> float:

@@ -17,7 +17,7 @@ from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
-from bayespbrl.policies import Policy, greedy
+from bayespbrl.policies import Policy, Sampler, greedy
 from bayespbrl.policies.choice import initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
 from bayespbrl.settings import Settings, Task, settings_for
@@ -26,6 +26,8 @@ from bayespbrl.utility.estimate import UtilityEstimate
 
 if TYPE_CHECKING:
     from bayespbrl.people.widget import ComparisonWidget
+
+VAIN_UNDOS = 10  # in a row: a person may press the key twice, a function would go on for ever
 
 
 class Learner:
@@ -113,7 +115,7 @@ class Learner:
         return self.state.finished(self.settings)
 
     @property
-    def policy(self) -> Any:
+    def policy(self) -> Sampler:
         """The best policy by the posterior, without its noise; the newest, with it, where updates are not checked.
 
         One that was started anew replaces the policy before it only where it is clearly better.
@@ -256,12 +258,16 @@ class Learner:
         if not callable(expert):
             raise ValueError(f"expert: expected a function of two trajectories, got {expert!r}")
         self._advance(progress)
+        vain = 0
         while (query := self._question_for(answerer, progress)) is not None:
             began = time.perf_counter()
             answer = parse_answer(expert(*query.trajectories))
             seconds = None if answerer is None else time.perf_counter() - began
-            if answer is Answer.UNDO and self.state.previous is None:
-                continue  # nothing to take back: the same question again
+            vain = vain + 1 if answer is Answer.UNDO and self.state.previous is None else 0
+            if vain == VAIN_UNDOS:
+                raise ValueError(f"expert: expected an answer, because there is none to take back, got {vain} undos")
+            if vain:
+                continue  # the same question again
             self._take_in([query], [answer], answerer, seconds)
             self._advance(progress)
         return self

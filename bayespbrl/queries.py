@@ -1,6 +1,8 @@
 """Step 4: which trajectories to ask about, and the question "this one or the best so far?" (paper, step 4).
 
 A query rule orders trajectories; the first is asked about, the next when that question is skipped or more are asked.
+Undominated trajectories in the order, as the incumbent, are left out: they are what the others are compared with.
+
 Three lines make one of your own, for `Learner(query=...)`:
 
     def newest(situation):
@@ -35,6 +37,7 @@ class QuerySituation:
       shown: numbers of those that some question has shown.
       incumbent: number of the newest undominated one.
       opponents: whom a trajectory would be compared with, by number; the incumbent where it names none.
+      undominated: numbers of all that no answer puts below another, about which no question is asked.
       estimate: the utility estimate of the last iteration.
       signal: of the last iteration's bound; None where the schedule has none.
       rng: of everything random.
@@ -48,6 +51,7 @@ class QuerySituation:
     signal: float | None
     rng: np.random.Generator
     opponents: Mapping[int, int] = field(default_factory=dict)
+    undominated: Sequence[int] = ()
 
     def draws(self) -> tuple[Float[np.ndarray, "s n"], Float[np.ndarray, "s n"]]:
         """Posterior draws of the utility of each new trajectory and of its opponent."""
@@ -140,20 +144,28 @@ QUERY_RULES: dict[str, QueryRule] = {
 
 
 def candidates(rule: QueryRule, situation: QuerySituation) -> tuple[int, ...]:
-    """The order of `rule`, checked, and cut to as many trajectories as are new.
+    """The order of `rule`, checked, without undominated trajectories, and cut to as many trajectories as are new.
 
     Raises:
-      ValueError: no order, or one that names a trajectory that does not exist or names it twice.
+      ValueError: no order, or one that names a trajectory that does not exist, names one twice, or names undominated
+        ones only.
     """
     order, known = rule(situation), len(situation.trajectories)
     try:
         numbers = [checks.whole("trajectory", number, 0) for number in order]
     except (TypeError, ValueError):
         numbers = []
+    name = getattr(rule, "__name__", type(rule).__name__)
     if not numbers or len(set(numbers)) < len(numbers) or max(numbers) >= known:
-        name = getattr(rule, "__name__", type(rule).__name__)
         raise ValueError(f"query rule {name}: expected different trajectory numbers below {known}, got {order!r}")
-    return tuple(numbers[: len(situation.new)])
+    standing = {situation.incumbent, *situation.undominated}
+    # compared with itself, or with its rivals of which it is one, a trajectory would be preferred over itself
+    left = [number for number in numbers if number not in standing]
+    if not left:
+        raise ValueError(
+            f"query rule {name}: expected a trajectory other than the undominated {sorted(standing)}, got {order!r}"
+        )
+    return tuple(left[: len(situation.new)])
 
 
 def random_candidates(numbers: Sequence[int], *, rng: np.random.Generator) -> tuple[int, ...]:

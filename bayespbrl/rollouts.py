@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int, Key, Shaped
 from bayespbrl.checks import whole
 from bayespbrl.envs import functional
 from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, environment_name, open_environment
-from bayespbrl.envs.stepping import episodes_by_interface
+from bayespbrl.envs.stepping import episodes_by_interface, outside_of
 from bayespbrl.policies.policy import AnyArray, Sampler
 from bayespbrl.trajectories import Trajectory
 
@@ -74,7 +74,8 @@ def rollout(
       starts: a seed for the reset of each episode; None: `key` decides on them.
 
     Raises:
-      ValueError: bad arguments; no time limit known; an environment that raises or returns NaN, named with the step.
+      ValueError: bad arguments; no time limit known; an environment that raises, or returns NaN or an observation that
+        is not one of its discrete space, named with the step.
     """
     env = open_environment(environment)
     steps = _checked_step_limit(env, policy, key, episodes, max_steps)
@@ -91,6 +92,11 @@ def rollout(
         observations, actions, rewards, terminated, lengths = (np.asarray(part) for part in run)
     if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
         raise ValueError(_not_finite(env, _first_not_finite(observations, rewards)))
+    if (outside := outside_of(dynamics.observation_space, observations)).any():
+        raise ValueError(
+            f"environment {environment_name(env)}: expected observations of {dynamics.observation_space}, got "
+            f"{observations[outside][0]} at {_where(int(np.argmax(outside.any(axis=0))))}"
+        )
     return tuple(
         Trajectory(states[: length + 1], acts[:length], signal[:length], bool(ended))
         for states, acts, signal, ended, length in zip(observations, actions, rewards, terminated, lengths, strict=True)
@@ -178,10 +184,14 @@ def _first_not_finite(observations: Shaped[np.ndarray, "n t1 ..."], rewards: Flo
 
 
 def _not_finite(env: gymnasium.Env, step: int) -> str:
-    where = f"step {step}" if step else "its reset"
     return (
-        f"environment {environment_name(env)}: expected finite observations and rewards, got NaN or infinity at {where}"
+        f"environment {environment_name(env)}: expected finite observations and rewards, got NaN or infinity at "
+        f"{_where(step)}"
     )
+
+
+def _where(step: int) -> str:
+    return f"step {step}" if step else "its reset"
 
 
 def _start(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Running, Key[Array, ""]]:
@@ -313,10 +323,11 @@ def _by_interface(
 ) -> Iterator[Trajectory]:
     policy_key = jax.random.split(key)[1]
     choose = _act if _is_pytree(policy) else _act_one_by_one
+    blocks = -(-steps // hold)  # of an episode: none is shared with the next
 
-    def act(counter: int, observations: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, "n ..."]:
+    def act(first: int, step: int, observations: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, "n ..."]:
         with jax.enable_x64(True):
-            actions = np.asarray(choose(policy, policy_key, counter // hold, observations))
+            actions = np.asarray(choose(policy, policy_key, first * blocks + step // hold, observations))
         if not np.isfinite(actions).all():
             raise ValueError(f"policy {type(policy).__name__}: expected finite actions, got NaN or infinity")
         return actions

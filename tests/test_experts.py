@@ -149,6 +149,13 @@ def test_the_mistaken_teacher_errs_as_often_as_told_and_on_top_of_the_stochastic
     assert close(wrong_share(Teacher(1.0, mistakes=0.2), 1.0), 0.8 * by_chance + 0.2 * (1 - by_chance))
 
 
+@pytest.mark.parametrize("expert", [Teacher(mistakes=0.1, seed=3), MarginExpert(2.0, seed=3)])
+def test_an_expert_who_errs_and_is_reversed_with_the_same_seed_errs_independently(expert):
+    errs = 0.1 if isinstance(expert, Teacher) else expert.error_probability(1.0)
+    reversed_too = NoisyExpert(expert, 0.1, seed=3)
+    assert close(wrong_share(reversed_too, 1.0), 0.9 * errs + 0.1 * (1 - errs))
+
+
 def test_the_myopic_teacher_weighs_the_last_rewards_most():
     early, late = trajectory([3.0, 0, 0]), trajectory([0, 0, 2.0])
     assert Teacher()(early, late) is Answer.FIRST
@@ -188,6 +195,9 @@ def test_errors_are_a_function_of_the_two_trajectories_in_either_order(expert):
     ("make", "message"),
     [
         (lambda: Teacher(rationality=0), "rationality"),
+        (lambda: Teacher(rationality=None), "rationality: expected a number > 0"),
+        (lambda: Teacher(least_return=None), "least_return: expected a number"),
+        (lambda: NoisyExpert("return", 0.1), "expert: expected a function of two trajectories, got 'return'"),
         (lambda: Teacher(discount=0), "discount"),
         (lambda: Teacher(least_return=np.nan), "least_return"),
         (lambda: Teacher(equal_within=-1), "equal_within"),

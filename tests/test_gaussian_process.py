@@ -9,7 +9,7 @@ from gymnasium.spaces import Box
 
 from bayespbrl.kernels import coordinates, inverse_bandwidths, radial_basis, squared_exponential
 from bayespbrl.policies import GaussianProcessPolicy, hyperparameter_search, sample_actions
-from bayespbrl.policies.hyperparameter_search import Hyperparameters, OutputSamples, search
+from bayespbrl.policies.hyperparameter_search import FAILED, Hyperparameters, OutputSamples, search
 from bayespbrl.policies.sparse_regression import fit_sparse_regression, inducing_rows, inverse_factor, precisions
 
 STATES = Box(-np.inf, np.inf, (2,))
@@ -239,6 +239,19 @@ def test_the_search_never_returns_worse_than_its_start_and_repeats_itself(asked)
     np.testing.assert_array_equal(one.hyperparameters.logarithms, found(100).hyperparameters.logarithms)
     expected = Hyperparameters(BANDWIDTHS, SIGNAL, NOISE).logarithms
     np.testing.assert_allclose(start.hyperparameters.logarithms, expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "converged"),
+    [
+        ({}, True),
+        ({"objective": np.array([-FAILED])}, False),
+        ({"objective": np.array([-2.0]), "noise_at_bound": np.array([True])}, False),
+    ],
+)
+def test_a_fit_has_converged_where_its_search_found_something_within_the_bounds(changes, converged):
+    policy = GaussianProcessPolicy.initial(Box(-1, 1, (2,)), Box(-1, 1, (1,)))
+    assert replace(policy, **changes).converged is converged
 
 
 def test_the_search_keeps_a_good_start_that_one_bold_generation_cannot_beat(asked):

@@ -16,6 +16,7 @@ from bayespbrl.policies import (
     TabularPolicy,
     clipped,
     sample_actions,
+    softmax,
 )
 from bayespbrl.trajectories import Trajectory, Transitions, transitions
 
@@ -315,6 +316,26 @@ def test_discrete_actions_in_continuous_states_leave_every_state_its_weight():
     chances = updated.policy.probabilities(np.array([[0.7, 0.0], [-0.7, 0.0]]))[:, 1]
     assert chances[0] > 0.8
     assert chances[1] < 0.2
+
+
+@pytest.mark.parametrize("newton_steps", [50, 1])
+def test_a_policy_that_knows_whether_its_fit_converged_says_so_in_the_summary(newton_steps, monkeypatch):
+    monkeypatch.setattr(softmax, "NEWTON_STEPS", newton_steps)
+    rng = np.random.default_rng(3)
+    states, actions = rng.uniform(-1, 1, size=(60, 2)), rng.integers(0, 2, 60)
+    steps = Transitions(states, actions, rng.uniform(-1, 1, (60, 2)), np.zeros(60), np.ones(60, bool))
+    updated = improve(
+        SoftmaxPolicy.initial(OBSERVATIONS, Discrete(2)),
+        steps,
+        np.where(states[:, 0] > 0, actions, 1.0 - actions),
+        action_space=Discrete(2),
+        state_features=lambda states: states,
+        state_action_features=StateActionProduct(lambda s: np.column_stack([s, np.ones(len(s))]), 2),
+        critic=Critic(0.0),
+    )
+    assert updated.summary()["policy_fit_converged"] is (newton_steps == 50)
+    tabular = improve(random_policy(), random_steps()[0], np.zeros(400))
+    assert "policy_fit_converged" not in tabular.summary()
 
 
 def test_further_updates_go_on_from_the_last_with_the_spread_held_until_the_policy_has_moved_by_the_bound():

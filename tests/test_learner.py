@@ -388,6 +388,14 @@ def test_nothing_can_be_undone_before_the_first_answer():
     assert run.run(lambda first, second: next(replies)).preferences.answers == 4
 
 
+def test_an_expert_who_only_undoes_is_refused():
+    asked = []
+    with pytest.raises(
+        ValueError, match="expert: expected an answer, because there is none to take back, got 10 undos"
+    ):
+        learner().run(lambda first, second: asked.append(1) or "undo" if len(asked) < 100 else "tie")
+
+
 def test_another_answer_after_undoing_leads_elsewhere():
     run = learner()
     run.ask()
@@ -725,6 +733,43 @@ def test_a_run_follows_a_query_rule_of_the_users_own_and_goes_on_with_it(tmp_pat
     assert load(tmp_path / "run").iterations == whole.iterations  # reading needs no rule
     with pytest.raises(ValueError, match="query: expected a function, because the settings say 'other', got none"):
         Learner("gridworld", query="other")
+
+
+def everything(situation):
+    return [situation.incumbent, *range(len(situation.trajectories) - 1, situation.incumbent, -1)]
+
+
+def by_themselves(situation):
+    return [situation.incumbent]
+
+
+@pytest.mark.parametrize("same_start", [False, True])
+def test_a_rule_may_name_the_incumbent_and_no_trajectory_is_compared_with_itself(same_start):
+    answers = itertools.cycle(["first", "tie", "second"])
+    options = {"same_start": same_start, "queries_per_iteration": 3, "query": everything}
+    run = learner(**options).run(lambda first, second: next(answers))
+    assert run.preferences.answers == 2 + 2 * 3
+    assert all(first != second for first, second in (*run.preferences.pairs, *run.preferences.ties))
+    assert len(set(run.preferences.undominated)) == len(run.preferences.undominated)
+
+
+def test_a_rule_that_names_the_incumbent_alone_is_refused_before_anything_is_logged():
+    run, log = remembered(query=by_themselves)
+    run.ask()
+    run.tell(["first"])
+    with pytest.raises(ValueError, match="query rule by_themselves: expected a trajectory other than the undominated"):
+        run.tell(["second"])
+    assert [entry.event["event"] for entry in log.entries][-2:] == ["answered", "improved"]
+    assert fingerprint(learner(log.entries).run(ReturnExpert()))["summaries"]  # another rule goes on
+
+
+def test_a_run_compared_by_start_asks_as_at_first_while_all_is_skipped():
+    run = learner(iterations=2, same_start=True).run(lambda first, second: "skip")
+    assert (run.finished, run.preferences.answers, run.state.queries) == (True, 0, 9 + 9)
+    told = learner(iterations=3, same_start=True)
+    while questions := told.ask():
+        told.tell(["skip" if told.state.iteration == 0 else ReturnExpert()(*questions[0].trajectories)])
+    assert [summary["answers"] for summary in told.iterations] == [0, 2, 3]
 
 
 def test_exploration_is_held_for_as_many_steps_as_the_settings_say(monkeypatch):

@@ -11,7 +11,9 @@ from bayespbrl.models.likelihoods import (
     Probit,
     WithLapses,
     WithTies,
+    likelihood_of,
     log_prob,
+    smoothed_probability,
     ties_of,
     total_log_prob,
     with_threshold,
@@ -129,6 +131,16 @@ def test_all_meet_the_protocol_and_bad_settings_are_named():
     ):
         with pytest.raises(ValueError, match=f"^{message}: expected"):
             PreferenceModel(**settings)
+
+
+def test_ties_without_which_answers_they_are_and_twice_a_threshold_are_refused():
+    with pytest.raises(ValueError, match="indifferent: expected which answers were ties"):
+        likelihood_of("logistic", 2, steepness=1.0, tie_threshold=0.2)
+    tied = WithTies(Logistic(1.0), 0.2, np.array([True]))
+    with pytest.raises(ValueError, match="likelihood: expected one without ties, got WithTies"):
+        with_threshold(tied, 0.2, np.array([True]))
+    with pytest.raises(ValueError, match="likelihood: expected one of this module, got object"):
+        smoothed_probability(object(), np.zeros(1), np.zeros(1))
 
 
 def test_a_preference_model_names_its_likelihood():

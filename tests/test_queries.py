@@ -319,3 +319,20 @@ def test_an_order_that_is_none_is_named(order_given):
 
     with pytest.raises(ValueError, match="query rule careless: expected different trajectory numbers below 4, got"):
         candidates(careless, situation(DRAWS, ZERO))
+
+
+def test_undominated_trajectories_in_an_order_are_left_out():
+    given = replace(situation(DRAWS, ZERO), undominated=(1, 3))
+    assert candidates(lambda _: [3, 1, 0, 2], given) == (0, 2)
+    assert candidates(lambda _: [3, 2, 1, 0], situation(DRAWS, ZERO)) == (2, 1, 0)  # the incumbent is always one
+
+
+@pytest.mark.parametrize("order_given", [[3], [1, 3]])
+def test_a_rule_that_names_undominated_trajectories_only_is_refused(order_given):
+    def fond(situation):
+        return order_given
+
+    given = replace(situation(DRAWS, ZERO), undominated=(1, 3))
+    message = r"query rule fond: expected a trajectory other than the undominated \[1, 3\], got \["
+    with pytest.raises(ValueError, match=message):
+        candidates(fond, given)

@@ -425,12 +425,14 @@ def test_a_schedule_may_report_any_statistics(tmp_path):
 def test_every_warning_has_a_remedy_and_what_is_not_in_order_is_warned_of(contents):
     assert [summary["iteration"] for summary in contents.iterations] == [1, 2, 3]
     changes = [{"utility_converged": False, "rhat_max": 1.5}, {"reps_converged": False}, {"bound_active": False}]
+    changes[1] |= {"policy_fit_converged": False}
     changes[2] |= {"entropy": 0.01, "value": -1000.0}
     warnings = warnings_of(changed(contents, changes))
     assert all(warning.remedy for warning in warnings)
     found = " ".join(warning.what for warning in warnings)
     assert "did not converge in iteration 1." in found
     assert "REPS did not converge in iteration 2:" in found
+    assert "The fit of the policy did not converge in iteration 2:" in found
     assert "bound was inactive in iteration" in found
     assert "entropy collapsed" in found
     assert "value has fallen" in found

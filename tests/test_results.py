@@ -253,3 +253,11 @@ def test_predictions_are_those_that_the_report_shows_and_old_runs_are_read_anew(
     data = shutil.copytree(tmp_path / "run", tmp_path / "data", ignore=shutil.ignore_patterns("gridworld", "results*"))
     assert call(monkeypatch, "results", data) == 0  # the four files are enough
     assert (data / "results.md").read_text() == (tmp_path / "run" / "results.md").read_text()
+
+
+def test_studies_whose_results_would_overwrite_each_other_are_refused(made, tmp_path, monkeypatch, capsys):
+    other = tmp_path / "elsewhere" / "made"
+    shutil.copytree(made, other)
+    line = refused(monkeypatch, capsys, "results", made, other, "--out", tmp_path / "out")
+    assert "out: expected studies in directories of different names, got made more than once" in line
+    assert not (tmp_path / "out").exists()

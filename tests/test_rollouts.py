@@ -1,6 +1,7 @@
 """Step 3: compiled rollouts, the gymnasium interface, and what happens when either goes wrong."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gymnasium
 import jax
@@ -174,6 +175,16 @@ def test_chance_is_held_through_the_interface_too():
         assert len(at) == 2
 
 
+def test_noise_is_not_held_from_one_episode_to_the_next():
+    mild = Gaussian(np.zeros(1), np.array([0.3]))
+    held = rollout(Plain(), mild, key=KEY, episodes=3, max_steps=9, hold=4)
+    for before, after in pairwise(held):
+        assert before.actions[-1, 0] != after.actions[0, 0]
+    for trajectory, at in zip(held, changes(held), strict=True):
+        assert len(trajectory) == 9
+        np.testing.assert_array_equal(at, [4, 8])
+
+
 @pytest.mark.parametrize("hold", [0, -1, True, 1.5, None])
 def test_a_hold_that_is_no_number_of_steps_is_refused(hold):
     with pytest.raises(ValueError, match="hold: expected a whole number >= 1"):
@@ -264,6 +275,15 @@ def test_pure_functions_that_return_nan_are_named_with_the_step(run, bad, step):
         run(Drifting({"bad": bad}), Coin(np.array(0.5)), key=KEY, episodes=2, max_steps=10)
 
 
+class Corridor(Drifting):
+    """Counts its steps in a space of five numbers, and leaves it."""
+
+    observation_space = Discrete(5)
+
+    def observation(self, state, rng, params=None):
+        return state[0].astype(int)
+
+
 # The gymnasium interface.
 
 
@@ -342,6 +362,37 @@ def test_an_environment_that_goes_wrong_is_named_with_the_step(env, message):
         rollout(env, STEER, key=KEY, episodes=1, max_steps=9)
     if env.fails:
         assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+class Rooms(gymnasium.Env):
+    """Shows the numbers of a list, one after the other."""
+
+    action_space = Discrete(2)
+
+    def __init__(self, shown, start=0):
+        self.shown, self.observation_space = shown, Discrete(3, start=start)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = list(self.shown)
+        return self.left.pop(0), {}
+
+    def step(self, action):
+        return self.left.pop(0), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (Rooms([0, 2, 7]), r"Rooms: expected observations of Discrete\(3\), got 7 at step 2"),
+        (Rooms([-1, 2]), r"Rooms: expected observations of Discrete\(3\), got -1 at its reset"),
+        (Rooms([5, 7, 8], start=5), r"Rooms: expected observations of Discrete\(3, start=5\), got 8 at step 2"),
+        (Corridor({"bad": ""}), r"Corridor: expected observations of Discrete\(5\), got 5 at step 5"),
+    ],
+)
+def test_a_discrete_observation_outside_its_space_is_named_with_the_step(env, message):
+    with pytest.raises(ValueError, match=message):
+        rollout(env, Coin(np.array(0.5)), key=KEY, episodes=1, max_steps=9)
 
 
 def test_a_policy_that_returns_nan_is_named():

@@ -80,7 +80,7 @@ def every_visit_preferences(
         yield Step(number, pairs, policy.with_table(best_actions(better)))
 
 
-Visits = tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]  # cells and numbers of actions
+Visits = tuple[Int[AnyArray, " t"], Int[np.ndarray, " t"]]  # cells and numbers of actions
 
 
 def sampled(preferred: Visits, other: Visits, before: Float[np.ndarray, "c a a"]) -> Float[np.ndarray, "c a a"]:
@@ -144,12 +144,8 @@ class GridPolicy:
     @classmethod
     def initial(cls, environment: gymnasium.Env) -> "GridPolicy":
         """The uniform policy for an environment; `ValueError` unless its spaces are bounded boxes."""
-        seen, acts = environment.observation_space, environment.action_space
-        for name, space in (("observations", seen), ("actions", acts)):
-            if not (isinstance(space, Box) and space.is_bounded() and len(space.shape) == 1):
-                raise ValueError(f"baseline epmc: expected {name} in a bounded Box of shape (n,), got {space}")
-        assert isinstance(seen, Box)
-        assert isinstance(acts, Box)
+        seen = _bounded("observations", environment.observation_space)
+        acts = _bounded("actions", environment.action_space)
         if acts.shape != (1,):
             raise ValueError(f"baseline epmc: expected actions of one dimension, got {acts.shape[0]}")
         values = np.linspace(acts.low.astype(float), acts.high.astype(float), 3)
@@ -160,7 +156,7 @@ class GridPolicy:
         """The same cells and actions with other probabilities."""
         return GridPolicy(table, self.low, self.high, self.actions, self.per_dimension)
 
-    def cells(self, observations: Float[AnyArray, "... s"]) -> Any:
+    def cells(self, observations: Float[AnyArray, "... s"]) -> Int[Array, "..."]:
         """The number of the cell of each observation."""
         share = (jnp.asarray(observations) - self.low) / (jnp.asarray(self.high) - self.low)
         places = jnp.clip((share * self.per_dimension).astype(int), 0, self.per_dimension - 1)
@@ -174,3 +170,9 @@ class GridPolicy:
         """a ~ π(·|s)."""
         chances = jnp.asarray(self.table)[self.cells(observation)]
         return jnp.asarray(self.actions)[jax.random.categorical(key, jnp.log(chances))]
+
+
+def _bounded(name: str, space: gymnasium.Space[Any]) -> Box:
+    if not (isinstance(space, Box) and space.is_bounded() and len(space.shape) == 1):
+        raise ValueError(f"baseline epmc: expected {name} in a bounded Box of shape (n,), got {space}")
+    return space

@@ -261,8 +261,13 @@ def results(
     """Write tables (Markdown, CSV) and figures of studies, with intervals and counted comparisons."""
     from bayespbrl.results import write_results
 
-    for directory in directories:
-        folder = out / directory.name if out is not None and len(directories) > 1 else out
+    names = [directory.absolute().name for directory in directories]
+    if out is not None and (again := sorted({name for name in names if names.count(name) > 1})):
+        raise ValueError(
+            f"out: expected studies in directories of different names, got {', '.join(again)} more than once"
+        )
+    for directory, name in zip(directories, names, strict=True):
+        folder = out / name if out is not None and len(directories) > 1 else out
         page, *others = write_results(directory, folder)
         console.print(f"Results: {page}; {', '.join(path.name for path in others)}")
 

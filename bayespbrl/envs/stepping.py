@@ -7,12 +7,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 from numpy.typing import ArrayLike
 
-from bayespbrl.envs.opening import environment_name, flattened, made_from
+from bayespbrl.envs.opening import as_given, environment_name, flattened, made_from
 
 MAX_LANES = 128  # copies of an environment stepped side by side
 PROBES = 10  # episodes of random actions
@@ -22,7 +22,7 @@ Episode = tuple[Rows, Rows, Float[np.ndarray, " t"], bool]
 
 def episodes_by_interface(
     env: gymnasium.Env,
-    act: Callable[[int, Rows], Rows],
+    act: Callable[[int, int, Rows], Rows],
     *,
     seeds: int | Sequence[int],
     episodes: int,
@@ -34,24 +34,24 @@ def episodes_by_interface(
     Args:
       env: from `open_environment`. If that made it from an id, copies run side by side; else the object itself, one
         episode after the other.
-      act: `act(counter, observations) -> actions` for a batch; the counter never repeats.
+      act: `act(first, step, observations) -> actions` for a batch of episodes, from number `first` on.
       seeds: of each episode's reset; one number is that of the first, and the others count up from it.
       steps: cap on the length of an episode.
       time_limit: replaces the environment's own limit where copies are made.
 
     Raises:
-      ValueError: the environment raised, or returned a number that is not finite; names it and the step.
+      ValueError: the environment raised, or returned a number that is not finite or an observation that is not one of
+        its discrete space; names it and the step.
     """
     lanes = min(episodes, MAX_LANES) if made_from(env) is not None else 1
     vector = _copies(env, lanes, time_limit, one_by_one=not isinstance(seeds, int))
-    name = environment_name(env)
     try:
         for first in range(0, episodes, lanes):
             if isinstance(seeds, int):
-                reset: Any = seeds + first
+                reset: int | list[int] = seeds + first
             else:  # the last lanes may have no episode left
                 reset = [int(seeds[min(first + lane, episodes - 1)]) for lane in range(lanes)]
-            vector_episodes = _batch(vector, name, act, seed=reset, first=first, steps=steps)
+            vector_episodes = _batch(vector, env, act, seed=reset, first=first, steps=steps)
             yield from vector_episodes[: episodes - first]
     finally:
         vector.close()
@@ -101,24 +101,31 @@ def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None, *, one_by_on
 
 
 def _batch(
-    vector: VectorEnv, name: str, act: Callable[[int, Rows], Rows], *, seed: Any, first: int, steps: int
+    vector: VectorEnv,
+    env: gymnasium.Env,
+    act: Callable[[int, int, Rows], Rows],
+    *,
+    seed: int | list[int],
+    first: int,
+    steps: int,
 ) -> list[Episode]:
-    """One episode a lane, from episode `first` on.
+    """One episode a lane, from episode `first` on; `env` is the one that `vector` copies.
 
     A lane that has ended goes on with the others (it resets itself) and is ignored.
     """
     lanes, seen, done = vector.num_envs, vector.single_observation_space, vector.single_action_space
+    name = environment_name(env)
     with _blaming(name, "its reset"):
-        observations, _ = vector.reset(seed=seed)
+        observations, _ = vector.reset(seed=seed)  # type: ignore[arg-type]  # copies take a list too
     alive, ended, lengths = np.ones(lanes, bool), np.zeros(lanes, bool), np.zeros(lanes, int)
-    states, actions, rewards = [_finite(name, "its reset", _wide(seen, observations))], [], []
+    states, actions, rewards = [_checked(env, "its reset", _wide(seen, observations))], [], []
     t = 0
     while t < steps and alive.any():
-        actions.append(_within(done, act(first * steps + t, states[-1])))
+        actions.append(_within(done, act(first, t, states[-1])))
         t += 1
         with _blaming(name, f"step {t}"):
             observations, reward, terminated, truncated, _ = vector.step(actions[-1])
-        _finite(name, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
+        _checked(env, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
         # what idle lanes return must not reach the policy as NaN
         states.append(np.nan_to_num(_wide(seen, observations)))
         rewards.append(np.asarray(reward, float))
@@ -142,12 +149,26 @@ def _within(space: gymnasium.Space[Any], actions: Rows) -> Rows:
     return np.asarray(actions).astype(np.int64)
 
 
-def _finite(name: str, where: str, *values: Rows) -> Rows:
-    if not all(np.isfinite(value).all() for value in values):
+def _checked(env: gymnasium.Env, where: str, observations: Rows, *rewards: Rows) -> Rows:
+    if not all(np.isfinite(values).all() for values in (observations, *rewards)):
         raise ValueError(
-            f"environment {name}: expected finite observations and rewards, got NaN or infinity at {where}"
+            f"environment {environment_name(env)}: expected finite observations and rewards, got NaN or infinity at "
+            f"{where}"
         )
-    return values[0]
+    if (outside := outside_of(env.observation_space, observations)).any():
+        space = as_given(env).observation_space
+        number = observations[outside][0] + getattr(space, "start", 0)
+        raise ValueError(
+            f"environment {environment_name(env)}: expected observations of {space}, got {number} at {where}"
+        )
+    return observations
+
+
+def outside_of(space: gymnasium.Space[Any], observations: Rows) -> Bool[np.ndarray, "..."]:
+    """Which observations are none of a `Discrete` space that counts from 0; the bounds of a `Box` are not looked at."""
+    if not isinstance(space, Discrete):
+        return np.zeros(len(observations), bool)
+    return (observations < 0) | (observations >= space.n)
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from bayespbrl.improvement.reps import (
     whitened,
 )
 from bayespbrl.policies import Policy, clipped, entropies, is_discrete, sample_actions
-from bayespbrl.policies.policy import ContinuousPolicy, DiscretePolicy
+from bayespbrl.policies.policy import ContinuousPolicy, DiscretePolicy, fit_converged
 
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
 NOTHING = 1e-3  # of the bound; weights that have moved by less have nothing to gain
@@ -137,8 +137,8 @@ class Improvement:
     action_standard_deviation: tuple[float, ...] | None
 
     def summary(self) -> dict[str, Any]:
-        """The figures as an iteration reports them."""
-        reps = self.reps
+        """The figures as an iteration reports them; `policy_fit_converged` is of policies that know it."""
+        reps, fitted = self.reps, fit_converged(self.policy)
         return {
             "kl_bound": reps.kl_bound,
             "bound_active": reps.bound_active,
@@ -151,6 +151,7 @@ class Improvement:
             "effective_samples": reps.effective_samples,
             "temperature": reps.temperature,
             "reps_converged": reps.converged,
+            **({} if fitted is None else {"policy_fit_converged": fitted}),
             "entropy": self.entropy,
             "action_standard_deviation": self.action_standard_deviation,
         }

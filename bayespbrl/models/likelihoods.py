@@ -271,7 +271,8 @@ def with_threshold(
     """A likelihood without ties, with this threshold; `indifferent` as in `WithTies`."""
     if isinstance(likelihood, WithLapses):
         return replace(likelihood, attentive=with_threshold(likelihood.attentive, threshold, indifferent))
-    assert isinstance(likelihood, Mixed | Logistic | Probit)
+    if not isinstance(likelihood, Mixed | Logistic | Probit):
+        raise ValueError(f"likelihood: expected one without ties, got {type(likelihood).__name__}")
     return WithTies(likelihood, threshold, indifferent)
 
 
@@ -303,7 +304,8 @@ def likelihood_of(
         ordered = WithLapses(ordered, lapse_rate)
     if tie_threshold is None:
         return ordered
-    assert indifferent is not None
+    if indifferent is None:
+        raise ValueError("indifferent: expected which answers were ties, because there is a tie_threshold, got None")
     return with_threshold(ordered, tie_threshold, indifferent)
 
 
@@ -324,7 +326,8 @@ def smoothed_probability(
         smooth = smoothed_probability(Logistic(likelihood.steepness), margins, spread)
         # eq. 8
         return np.asarray((1 - share) * _widened(margins, np.zeros(1), spread) + share * smooth)
-    assert isinstance(likelihood, Logistic | Probit)
+    if not isinstance(likelihood, Logistic | Probit):
+        raise ValueError(f"likelihood: expected one of this module, got {type(likelihood).__name__}")
     weights, scales = _logistic_mixture() if isinstance(likelihood, Logistic) else (np.ones(1), np.ones(1))
     # Andrews & Mallows (1974): sigmoid = Σⱼ wⱼ Φ(·/hⱼ)
     parts = zip(weights, scales, strict=True)

@@ -4,13 +4,15 @@ Given many answers the posterior of a smooth likelihood is nearly the Gaussian r
 rotation forgets the start, and the gradient of the small residual is needed only a few times on the way.
 """
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax, random
 from jaxtyping import Float, PRNGKeyArray
 
-from bayespbrl.models.likelihoods import total_log_prob
+from bayespbrl.models.likelihoods import Scalar, total_log_prob
 from bayespbrl.models.preference_problem import PreferenceProblem
 
 # Gradients in a quarter of a rotation.
@@ -21,9 +23,8 @@ _State = tuple[Float[Array, " q"], Float[Array, " q"], Float[Array, ""], Float[A
 def split_move(key: PRNGKeyArray, z: Float[Array, " q"], problem: PreferenceProblem) -> Float[Array, " q"]:
     """z after a quarter of a rotation round the reference and a Metropolis test; the problem has an excess."""
     key_velocity, key_test = random.split(key)
-    centre, width, excess = problem.centre, problem.width, problem.excess
-    assert width is not None
-    assert excess is not None
+    centre = problem.centre
+    width, excess = cast(Scalar, problem.width), cast(Scalar, problem.excess)
     margins_at_centre = problem.loadings @ centre
 
     def residual(x: Float[Array, " q"]) -> Float[Array, ""]:

@@ -12,7 +12,7 @@ from bayespbrl.policies.batch import entropies, log_probabilities, sample_action
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.greedy import greedy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
-from bayespbrl.policies.policy import Policy, is_discrete
+from bayespbrl.policies.policy import Policy, Sampler, is_discrete
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.spaces import clipped
 from bayespbrl.policies.tabular import TabularPolicy
@@ -21,6 +21,7 @@ __all__ = [
     "GaussianProcessPolicy",
     "LinearGaussianPolicy",
     "Policy",
+    "Sampler",
     "SoftmaxPolicy",
     "TabularPolicy",
     "clipped",

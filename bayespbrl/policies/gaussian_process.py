@@ -17,7 +17,13 @@ from numpy.typing import ArrayLike
 
 from bayespbrl import kernels
 from bayespbrl.checks import matrix, positive, whole
-from bayespbrl.policies.hyperparameter_search import Hyperparameters, OutputSamples, SearchResult, search
+from bayespbrl.policies.hyperparameter_search import (
+    FAILED,
+    Hyperparameters,
+    OutputSamples,
+    SearchResult,
+    search,
+)
 from bayespbrl.policies.policy import AnyArray
 from bayespbrl.policies.samples import weighted_samples
 from bayespbrl.policies.spaces import centre_and_range, dimension, initial_deviation
@@ -99,6 +105,11 @@ class GaussianProcessPolicy:
             objective=np.full(actions, np.nan),
             noise_at_bound=np.zeros(actions, dtype=bool),
         )
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last search found hyper-parameters that can be fitted, with σ² within its bounds."""
+        return not (np.any(np.asarray(self.objective) <= -FAILED) or np.any(self.noise_at_bound))
 
     def moments(self, observation: Float[AnyArray, " s"]) -> tuple[Float[Array, " a"], Float[Array, " a"]]:
         """Mean and variance of each action dimension at one observation, traceable. O(AM²)."""

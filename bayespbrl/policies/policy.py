@@ -27,8 +27,9 @@ class Policy(Sampler, Protocol):
     the same type as an argument (`batch` maps them over N observations); the others take and return NumPy arrays.
     Policies over discrete actions also have `probabilities(observations) -> (N, A)`, those over continuous actions
     `action_standard_deviation(observations) -> (N, A)`. They may have `fit_mean`, called as `fit` is, which holds the
-    spread; it takes the place of `fit` in all but the first update of an iteration; and `mode(observation)`, the most
-    probable action, JAX-traceable: without it a run keeps the policy with its noise.
+    spread; it takes the place of `fit` in all but the first update of an iteration; `mode(observation)`, the most
+    probable action, JAX-traceable: without it a run keeps the policy with its noise; and `converged`, whether the last
+    fit succeeded, which a run reports.
     """
 
     @classmethod
@@ -99,6 +100,12 @@ class WithMode(Sampler, Protocol):
 def has_mode(policy: object) -> TypeGuard[WithMode]:
     """Whether a policy knows its most probable action; one of the user's may not."""
     return callable(getattr(type(policy), "mode", None))
+
+
+def fit_converged(policy: object) -> bool | None:
+    """Whether the last fit of a policy succeeded; None where the policy does not know."""
+    known = getattr(policy, "converged", None)
+    return None if known is None else bool(np.all(known))
 
 
 def is_discrete(policy: object) -> TypeGuard[DiscretePolicy]:

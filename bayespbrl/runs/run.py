@@ -14,7 +14,7 @@ from bayespbrl.envs.opening import AnyEnvironment, from_plain, imported_by_name,
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
-from bayespbrl.policies import Policy
+from bayespbrl.policies import Policy, Sampler
 from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
 from bayespbrl.queries import QueryRule, highest_utility
@@ -157,7 +157,7 @@ class Run:
         """The newest policy, with its noise."""
         return self._actor(self.learner.last_policy)
 
-    def _actor(self, policy: Policy) -> Actor:
+    def _actor(self, policy: Sampler) -> Actor:
         environment, given = self.learner.environment, self.learner.given
         return Actor(
             policy,

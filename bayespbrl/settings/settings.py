@@ -6,7 +6,7 @@ Users name an option alone: in keywords, on the command line, in `settings.json`
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 from bayespbrl import checks
 from bayespbrl.experts import SIMULATED
@@ -196,8 +196,7 @@ class Settings:
         """The limit on iterations: `iterations`, else three for every two answers, plus those of a restarted policy."""
         if self.iterations is not None:
             return self.iterations
-        assert self.questions.answers is not None
-        most = 3 * self.questions.answers // 2
+        most = 3 * cast(int, self.questions.answers) // 2  # there is one of the two limits
         return max(most, LAST_ITERATIONS) + self._restarted if self._restarted else most + LAST_ITERATIONS
 
     @property
@@ -246,7 +245,7 @@ class Settings:
         return self.critic.discount if given is None else given
 
 
-PARTS: dict[str, Any] = {
+PARTS: dict[str, type[Any]] = {
     "model": PreferenceModel,
     "estimation": Estimation,
     "features": Features,

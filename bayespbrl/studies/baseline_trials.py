@@ -59,10 +59,9 @@ def read_baseline(directory: Path | str) -> dict[str, Any]:
     """
     file = Path(directory) / BASELINE_FILE
     try:
-        content = json.loads(file.read_text())
+        content: dict[str, Any] = json.loads(file.read_text())
         if not content["iterations"]:
             raise KeyError("iterations")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file}: expected the values of a baseline, got {error}") from error
-    assert isinstance(content, dict)
     return content

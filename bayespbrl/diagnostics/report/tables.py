@@ -17,7 +17,8 @@ from bayespbrl.trajectories import Trajectory
 
 MEASURED = (
     *("answers", "pairs", "pairs_satisfied", "value", "kl_bound", "bound_active", "kl", "kl_fitted_policy", "updates"),
-    *("effective_samples", "temperature", "reps_converged", "entropy", "action_standard_deviation"),
+    *("effective_samples", "temperature", "reps_converged", "policy_fit_converged"),
+    *("entropy", "action_standard_deviation"),
     *("rhat_max", "effective_sample_size_min", "utility_converged", "log_evidence"),
 )
 DRAWS = 1000  # a standard deviation is then known to a fortieth of itself

@@ -68,8 +68,15 @@ def _of_updates(table: xr.Dataset) -> Iterator[ReportWarning]:
 
 
 def _of_fitted_policy(table: xr.Dataset) -> Iterator[ReportWarning]:
-    """The KL of the fitted policy against the KL that REPS reached."""
+    """Whether the policy could be fitted, and the KL of the fitted policy against the KL that REPS reached."""
     iteration = table["iteration"].values
+    if (failed := iteration[table["policy_fit_converged"].values == 0]).size:
+        yield ReportWarning(
+            f"The fit of the policy did not converge in {_which(failed)}: the policy may not follow the weights of "
+            "REPS there.",
+            "Compare the fitted policy's KL with the KL that REPS reached. Harmless where they agree. Otherwise try a "
+            "smaller --kl-bound or another kind of policy (--policy).",
+        )
     # of several updates the policy's KL is that of all together, and REPS' own that of the last alone
     several = table["updates"].values > 1
     fitted, reached = table["kl_fitted_policy"].values, np.where(several, table["kl_bound"], table["kl"])
