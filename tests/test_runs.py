@@ -10,6 +10,7 @@ from unittest import mock
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -575,6 +576,23 @@ def test_a_run_with_features_of_the_users_own_wants_them_again(tmp_path, answers
     if utility == "linear-program":
         assert fingerprint(run) == fingerprint(whole)
     np.testing.assert_array_equal(run.policy.table, whole.policy.table)
+
+
+@pytest.mark.parametrize("kind", [np.ndarray.tolist, lambda values: jnp.asarray(values, dtype=jnp.float32)])
+def test_features_that_are_lists_or_of_single_precision_give_the_same_utilities_after_loading(tmp_path, kind):
+    def features(states):
+        return kind(np.sin(np.outer(np.arange(25), [0.3, 0.7, 1.1]))[states])
+
+    learner = start(tmp_path / "run", features=features)
+    for _ in range(2):
+        learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    loaded = bayespbrl.load(tmp_path / "run", features=features)
+    states, trajectories = np.arange(25), learner.trajectories
+    assert learner.estimate.utilities(states).any()
+    np.testing.assert_array_equal(loaded.estimate.utilities(states), learner.estimate.utilities(states))
+    np.testing.assert_array_equal(
+        loaded.estimate.trajectory_utilities(trajectories), learner.estimate.trajectory_utilities(trajectories)
+    )
 
 
 def test_features_for_a_run_that_has_none_are_refused(finished):
