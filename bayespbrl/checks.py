@@ -120,6 +120,19 @@ def indices(name: str, values: Any, number: int) -> np.ndarray:
     return array.astype(np.int64)
 
 
+def pairs(name: str, values: Any) -> np.ndarray:
+    """`values` as an int64 array of shape (K, 2), where they are K pairs of integers."""
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name}: expected pairs of integers, got {_shortened(values)}") from error
+    if array.shape in ((0,), (0, 2)):
+        return np.zeros((0, 2), dtype=np.int64)
+    if array.ndim != 2 or array.shape[1] != 2 or not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name}: expected pairs of integers, got {_shortened(values)}")
+    return array.astype(np.int64)
+
+
 def _shortened(values: Any) -> str:
     text = " ".join(repr(values).split())
     return text if len(text) <= 60 else text[:60] + "…"
