@@ -136,6 +136,12 @@ def test_the_policy_acts(finished):
     assert policy.act(np.int64(12), key=key) == policy.act(12, key=key) == policy(12, key=key)
 
 
+@pytest.mark.parametrize("observation", [np.zeros(3), [1], [[0, 1]]])
+def test_the_policy_refuses_an_observation_of_another_shape(finished, observation):
+    with pytest.raises(ValueError, match=r"observation: expected shape \(\), got \("):
+        bayespbrl.load(finished).policy.act(observation)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(2, start=1), gymnasium.spaces.Box(-1, 1, (1, 2))])
 def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):
@@ -626,6 +632,17 @@ class Corridor(gymnasium.Env):
     def step(self, action):
         self.position += 1 if action == (self.np_random.random() < 0.8) else -1
         return self.position, float(self.position), self.position in (0, 6), False, {}
+
+
+@pytest.mark.parametrize("env", ["swing-up", Corridor()], ids=["box", "fewer states"])
+@pytest.mark.parametrize("read", [bayespbrl.load, runs.resume])
+def test_another_environment_than_the_runs_is_refused(copy, read, env):
+    before = contents(copy)
+    with pytest.raises(
+        ValueError, match=r"copy: states of the run: expected entries of (Box|Discrete)\(.*, got int64 of"
+    ):
+        read(copy, env=env)
+    assert contents(copy) == before
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import rollouts
-from bayespbrl.envs.opening import AnyEnvironment, from_plain, imported_by_name, to_plain
+from bayespbrl.envs.opening import AnyEnvironment, check_of_space, from_plain, imported_by_name, to_plain
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
@@ -121,6 +121,9 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
     try:
         learner = Learner(settings.env if env is None else env, **own, entries=entries, kept=settings)
         log.check_complete(learner.state, summarised)
+        for trajectory in learner.trajectories:  # of another environment, where env= is a wrong one
+            check_of_space("states of the run", trajectory.states, learner.environment.observation_space)
+            check_of_space("actions of the run", trajectory.actions, learner.environment.action_space)
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
     return learner
