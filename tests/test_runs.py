@@ -1,5 +1,6 @@
 """A run on disk: what it holds, that it comes back bit for bit, and what happens to damaged ones."""
 
+import errno
 import json
 import multiprocessing
 import os
@@ -211,6 +212,35 @@ def test_a_path_that_exists_is_refused_and_nothing_changed(tmp_path, finished, k
         start(path)
     assert contents(tmp_path) == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["taken"]
+
+
+def test_a_place_that_may_not_be_looked_at_is_refused(tmp_path, monkeypatch):
+    def forbidden(path, **options):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "exists", forbidden)
+        with pytest.raises(ValueError, match=r"run: expected a place where a run directory can be made, got .*denied"):
+            start(tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["drop_partial_line", "write_summary"])
+def test_a_run_that_cannot_be_written_is_not_resumed_but_loaded(copy, monkeypatch, what):
+    denied = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
+    monkeypatch.setattr(RunDirectory, what, denied)
+    before = contents(copy)
+    with pytest.raises(ValueError, match=r"copy: expected a run that can be written to, got .*Permission denied"):
+        runs.resume(copy)
+    bayespbrl.load(copy)
+    assert contents(copy) == before
+
+
+def test_a_log_that_cannot_be_read_is_named(copy, monkeypatch):
+    denied = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
+    monkeypatch.setattr(run_directory, "read_log_lines", denied)
+    with pytest.raises(ValueError, match=r"copy: events\.jsonl: expected a log that can be read, got .*denied"):
+        bayespbrl.load(copy)
 
 
 def test_bad_options_leave_nothing_behind(tmp_path):

@@ -65,14 +65,17 @@ def resume(
         may be a stranger's, and importing runs code.
 
     Raises:
-      ValueError: a package that may not be imported; a directory that is no run, or a file in it that is truncated
-        or foreign.
+      ValueError: a package that may not be imported; an environment with other states or actions than the run's; a
+        directory that is no run or cannot be written, or a file in it that is truncated or foreign.
     """
     log = RunDirectory.open(directory)
     _check_import(log, env, import_package)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
-    log.drop_partial_line()
-    log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
+    try:
+        log.drop_partial_line()
+        log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
+    except OSError as error:
+        raise ValueError(f"{log.path}: expected a run that can be written to, got {error}") from error
     return learner.logged(log)
 
 
