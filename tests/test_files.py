@@ -1,6 +1,8 @@
 """Files are whole or not there, whatever goes wrong while they are written."""
 
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -34,10 +36,31 @@ def test_an_error_leaves_the_file_as_it_was_and_nothing_beside_it(tmp_path, monk
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_what_a_killed_process_left_aside_does_not_hinder_the_next_write(tmp_path):
-    (tmp_path / "file.part").write_text("left over, and longer than what follows")
-    write_file(tmp_path / "file", "new")
-    assert (tmp_path / "file").read_text() == "new"
+def test_what_a_killed_process_left_aside_is_deleted_once_it_is_old_and_nothing_else_is(tmp_path):
+    killed = "from pathlib import Path; import os, sys; from bayespbrl.runs.files import written_aside\n"
+    killed += "with written_aside(Path(sys.argv[1])) as aside: aside.write_text('half'); os._exit(9)"
+    assert subprocess.run([sys.executable, "-c", killed, tmp_path / "file"], check=False).returncode == 9
+    [left] = tmp_path.iterdir()
+    assert left.name.startswith("file.")
+    assert left.name.endswith(".part")
+    others = [tmp_path / name for name in ("movie.part", "file.part", "file.12-0123abc.part", ".12-01234567.part")]
+    for other in others:
+        other.write_text("a stranger's")
+        os.utime(other, (0, 0))
+    write_file(tmp_path / "another", "new")
+    assert left.read_text() == "half"  # it may be on its way
+    os.utime(left, (0, 0))
+    write_file(tmp_path / "another", "new")
+    assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "another", *others])
+
+
+def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
+    with written_aside(tmp_path / "file") as first:
+        first.write_text("first")
+        with written_aside(tmp_path / "file") as second:
+            second.write_text("second")
+        assert (tmp_path / "file").read_text() == "second"
+    assert (tmp_path / "file").read_text() == "first"
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
