@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -78,3 +79,17 @@ def test_a_netcdf_file_has_all_groups_and_no_room_to_spare(tmp_path):
     with xr.open_datatree(tmp_path / "tree.nc", engine="h5netcdf") as opened:  # another library than the one that wrote
         assert opened.load().identical(tree)
     assert (tmp_path / "tree.nc").stat().st_size < 16_000
+
+
+@pytest.mark.parametrize(("place", "value"), [(8, 0), (8, 1), (8, 4), (9, 4)])
+def test_a_netcdf_file_whose_superblock_is_of_another_kind_is_not_cut(tmp_path, monkeypatch, place, value):
+    content = bytearray(1000)
+    content[8], content[9], content[28] = 2, 8, 100
+    opened = mock.Mock(close=lambda: memoryview(content))
+    monkeypatch.setattr("bayespbrl.runs.files.netCDF4.Dataset", lambda *arguments, **options: opened)
+    monkeypatch.setattr(xr.Dataset, "dump_to_store", lambda *arguments: None)
+    monkeypatch.setattr("bayespbrl.runs.files.NetCDF4DataStore", lambda group: None)
+    write_netcdf(tmp_path / "cut.nc", xr.Dataset())
+    content[place] = value
+    write_netcdf(tmp_path / "whole.nc", xr.Dataset())
+    assert [(tmp_path / name).stat().st_size for name in ("cut.nc", "whole.nc")] == [100, 1000]

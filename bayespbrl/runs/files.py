@@ -63,8 +63,17 @@ def write_netcdf(file: Path, data: xr.Dataset | xr.DataTree) -> None:
                 node.to_dataset(inherit=False).dump_to_store(NetCDF4DataStore(group))
         finally:
             content = opened.close()
-    # the buffer has room to spare; the superblock says where the file ends (HDF5 file format, versions 2 and 3)
-    write_file(file, content[: int.from_bytes(content[28:36], "little")])
+    write_file(file, content[: _end_of(content)])
+
+
+def _end_of(content: memoryview) -> int:
+    """Where an HDF5 file ends in a buffer with room to spare.
+
+    That is the end of the buffer where the superblock is of an unknown kind: bytes after its end do a file no harm.
+    """
+    if content[8] not in (2, 3) or content[9] != 8:  # version, and bytes of an address (HDF5 file format)
+        return len(content)
+    return int.from_bytes(content[28:36], "little")
 
 
 def write_file(file: Path, content: str | bytes | memoryview) -> None:
