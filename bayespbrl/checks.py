@@ -74,14 +74,21 @@ def short_name(name: str, value: Any) -> str:
 
 
 def finite(name: str, values: Any) -> None:
-    """Check that an array holds neither NaN nor infinity."""
-    if not np.all(np.isfinite(values)):
+    """Check that an array holds numbers, and neither NaN nor infinity."""
+    try:
+        fits = bool(np.all(np.isfinite(values)))
+    except (TypeError, ValueError) as error:  # text, None, rows of different lengths
+        raise ValueError(f"{name}: expected finite numbers, got {_shortened(values)}") from error
+    if not fits:
         raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
 
 
 def matrix(name: str, values: Any, *, columns: int | None = None) -> np.ndarray:
     """`values` as a finite float64 array of shape (N, columns); any number of columns when None."""
-    array = np.asarray(values, dtype=np.float64)
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected rows of numbers, all equally long, got {_shortened(values)}") from error
     if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
         raise ValueError(f"{name}: expected shape (N, {'D' if columns is None else columns}), got {array.shape}")
     finite(name, array)
@@ -111,6 +118,24 @@ def indices(name: str, values: Any, number: int) -> np.ndarray:
     if array.size and not (array.min() >= 0 and array.max() < number):
         raise ValueError(f"{name}: expected numbers in 0 … {number - 1}, got {array.min()} … {array.max()}")
     return array.astype(np.int64)
+
+
+def pairs(name: str, values: Any) -> np.ndarray:
+    """`values` as an int64 array of shape (K, 2), where they are K pairs of integers."""
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name}: expected pairs of integers, got {_shortened(values)}") from error
+    if array.shape in ((0,), (0, 2)):
+        return np.zeros((0, 2), dtype=np.int64)
+    if array.ndim != 2 or array.shape[1] != 2 or not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name}: expected pairs of integers, got {_shortened(values)}")
+    return array.astype(np.int64)
+
+
+def _shortened(values: Any) -> str:
+    text = " ".join(repr(values).split())
+    return text if len(text) <= 60 else text[:60] + "…"
 
 
 def _is_number(value: Any) -> bool:

@@ -7,6 +7,7 @@ observations; `checked_features` calls it.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -295,8 +296,7 @@ class FeatureSource:
         Where none of them ended before the time limit, all are equally long, and there is no constant feature.
         """
         if self.own is not None:
-            own = self.own
-            return lambda states: checked_features(own, states)
+            return partial(checked_features, self.own)
         space = self.observation_space
         if options.diffusion and isinstance(space, Discrete) and space.n <= MOST_CONNECTED:
             return diffusion_basis(trajectories, int(space.n))
@@ -321,7 +321,7 @@ def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."
     name = getattr(features, "__name__", type(features).__name__)
     if not callable(features):
         raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
-    values = np.asarray(features(states))
+    values = np.asarray(features(np.asarray(states)))
     if values.ndim != 2 or len(values) != len(states) or values.shape[1] == 0:
         raise ValueError(f"features {name}: expected shape ({len(states)}, D), got {values.shape}")
     if not (np.issubdtype(values.dtype, np.number) or values.dtype == bool) or np.iscomplexobj(values):

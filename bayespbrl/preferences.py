@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from bayespbrl import checks
 from bayespbrl.trajectories import Trajectory
 
 
@@ -281,9 +282,9 @@ def pair_differences(
     """ψ(preferred) − ψ(dominated) for each of K pairs (eq. 5).
 
     Raises:
-      ValueError: a pair with an unknown trajectory, or with the same one twice.
+      ValueError: no pairs of integers; a pair with an unknown trajectory, or with the same one twice.
     """
-    numbers = np.asarray(pairs, dtype=np.int64).reshape(len(pairs), 2)
+    numbers = checks.pairs("pairs", pairs)
     if np.any(numbers < 0) or np.any(numbers >= len(trajectory_features)):
         raise ValueError(f"pairs: expected trajectory numbers in 0 … {len(trajectory_features) - 1}, got {pairs}")
     if np.any(numbers[:, 0] == numbers[:, 1]):

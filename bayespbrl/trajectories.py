@@ -13,7 +13,7 @@ DISCOUNT = 0.98  # γ of Q, and of ψ(τ) where no learner says otherwise; the p
 
 @dataclass(frozen=True, repr=False)
 class Trajectory:
-    """One trajectory of T steps.
+    """One trajectory of T steps; lists become arrays.
 
     Attributes:
       states: s₀ … s_T as observed; shape (T+1, S) float64, or (T+1,) int64 where observations are discrete.
@@ -22,7 +22,7 @@ class Trajectory:
       terminated: whether s_T is terminal (a time limit is not).
 
     Raises:
-      ValueError: lengths that do not fit together, or an entry that is not finite.
+      ValueError: lengths that do not fit together, or an entry that is no finite number.
     """
 
     states: Shaped[np.ndarray, "t1 ..."]
@@ -31,6 +31,12 @@ class Trajectory:
     terminated: bool = False
 
     def __post_init__(self) -> None:
+        for name in ("states", "actions", "rewards"):
+            given = getattr(self, name)
+            finite(f"trajectory: {name}", given)
+            if np.ndim(given) == 0:
+                raise ValueError(f"trajectory: {name}: expected one entry for each step, got {given!r}")
+            object.__setattr__(self, name, np.asarray(given))  # how a frozen dataclass sets an attribute
         steps = len(self.actions)
         if steps == 0:
             raise ValueError("trajectory: expected at least one step, got none")
@@ -39,8 +45,6 @@ class Trajectory:
                 f"trajectory: expected T+1 states, T actions and T rewards, got {len(self.states)} states, "
                 f"{steps} actions and {len(self.rewards)} rewards"
             )
-        for name in ("states", "actions", "rewards"):
-            finite(f"trajectory: {name}", getattr(self, name))
 
     def __repr__(self) -> str:
         return f"Trajectory(steps={len(self)}, terminated={self.terminated})"

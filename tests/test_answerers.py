@@ -446,6 +446,13 @@ def test_answers_collected_elsewhere_by_hand(tmp_path):
     assert read_answers(tmp_path / "plain.csv").answerers is None
 
 
+@pytest.mark.parametrize("mark", ["", "\ufeff"], ids=["plain", "byte-order mark"])
+def test_a_byte_order_mark_and_spaces_around_cells_do_no_harm(tmp_path, mark):
+    (tmp_path / "excel.csv").write_text(f"{mark}first, second, answer, answerer\n0, 1,first , Ada\n1,2, tie,Ada \n")
+    read = read_answers(tmp_path / "excel.csv")
+    assert (read.pairs, read.ties, read.answerers) == (((0, 1),), ((1, 2),), ("Ada", "Ada"))
+
+
 @pytest.mark.slow
 def test_a_utility_is_inferred_from_answers_collected_elsewhere(tmp_path):
     read = read_answers(write_answers(tmp_path / "answers.csv", PAST))
@@ -458,12 +465,15 @@ def test_a_utility_is_inferred_from_answers_collected_elsewhere(tmp_path):
     [
         ("first,second\n0,1\n", "expected the columns first, second, answer, got first, second"),
         ("", "expected the columns first, second, answer, got none"),
-        ("first,second,answer\n0,1,first\n0,x,first\n", "line 3: invalid literal"),
+        ("first,second,answer\n0,1,first\n0,x,first\n", "line 3: second: expected a whole number >= 0, got 'x'"),
+        ("first,second,answer\n0,1,first\n,1,first\n", "line 3: first: expected a whole number >= 0, got ''"),
         ("first,second,answer\n0,-1,first\n", "line 2: second: expected a whole number >= 0"),
-        ("first,second,answer\n0,0,first\n", "line 2: expected an answer about two different things"),
-        ("first,second,answer\n0,1,undo\n", "line 2: expected an answer about two different things"),
-        ("first,second,answer\n0,1,both\n", "line 2: expert: expected one of"),
-        ("first,second,answer\n0\n", "line 2: invalid literal"),
+        ("first,second,answer\n0,0,first\n", "line 2: second: expected another number than first, got 0"),
+        ("first,second,answer\n0,1,undo\n", "line 2: answer: expected one of first, second, tie, skip, got 'undo'"),
+        ("first,second,answer\n0,1,both\n", "line 2: answer: expected one of first, second, tie, skip, got 'both'"),
+        ("first,second,answer\n0,1,First\n", "line 2: answer: expected one of .*, got 'First'"),
+        ("first,second,answer\n0\n", "line 2: second: expected a whole number >= 0, got ''"),
+        ("first,second,answer\n0,1\n", "line 2: answer: expected one of .*, got ''"),
         ("first,second,answer,answerer\n0,1,tie, \n", "line 2: answerer: expected a printable name"),
     ],
 )

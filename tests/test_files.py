@@ -1,6 +1,9 @@
 """Files are whole or not there, whatever goes wrong while they are written."""
 
 import os
+import subprocess
+import sys
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -34,10 +37,31 @@ def test_an_error_leaves_the_file_as_it_was_and_nothing_beside_it(tmp_path, monk
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_what_a_killed_process_left_aside_does_not_hinder_the_next_write(tmp_path):
-    (tmp_path / "file.part").write_text("left over, and longer than what follows")
-    write_file(tmp_path / "file", "new")
-    assert (tmp_path / "file").read_text() == "new"
+def test_what_a_killed_process_left_aside_is_deleted_once_it_is_old_and_nothing_else_is(tmp_path):
+    killed = "from pathlib import Path; import os, sys; from bayespbrl.runs.files import written_aside\n"
+    killed += "with written_aside(Path(sys.argv[1])) as aside: aside.write_text('half'); os._exit(9)"
+    assert subprocess.run([sys.executable, "-c", killed, tmp_path / "file"], check=False).returncode == 9
+    [left] = tmp_path.iterdir()
+    assert left.name.startswith("file.")
+    assert left.name.endswith(".part")
+    others = [tmp_path / name for name in ("movie.part", "file.part", "file.12-0123abc.part", ".12-01234567.part")]
+    for other in others:
+        other.write_text("a stranger's")
+        os.utime(other, (0, 0))
+    write_file(tmp_path / "another", "new")
+    assert left.read_text() == "half"  # it may be on its way
+    os.utime(left, (0, 0))
+    write_file(tmp_path / "another", "new")
+    assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "another", *others])
+
+
+def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
+    with written_aside(tmp_path / "file") as first:
+        first.write_text("first")
+        with written_aside(tmp_path / "file") as second:
+            second.write_text("second")
+        assert (tmp_path / "file").read_text() == "second"
+    assert (tmp_path / "file").read_text() == "first"
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
@@ -55,3 +79,17 @@ def test_a_netcdf_file_has_all_groups_and_no_room_to_spare(tmp_path):
     with xr.open_datatree(tmp_path / "tree.nc", engine="h5netcdf") as opened:  # another library than the one that wrote
         assert opened.load().identical(tree)
     assert (tmp_path / "tree.nc").stat().st_size < 16_000
+
+
+@pytest.mark.parametrize(("place", "value"), [(8, 0), (8, 1), (8, 4), (9, 4)])
+def test_a_netcdf_file_whose_superblock_is_of_another_kind_is_not_cut(tmp_path, monkeypatch, place, value):
+    content = bytearray(1000)
+    content[8], content[9], content[28] = 2, 8, 100
+    opened = mock.Mock(close=lambda: memoryview(content))
+    monkeypatch.setattr("bayespbrl.runs.files.netCDF4.Dataset", lambda *arguments, **options: opened)
+    monkeypatch.setattr(xr.Dataset, "dump_to_store", lambda *arguments: None)
+    monkeypatch.setattr("bayespbrl.runs.files.NetCDF4DataStore", lambda group: None)
+    write_netcdf(tmp_path / "cut.nc", xr.Dataset())
+    content[place] = value
+    write_netcdf(tmp_path / "whole.nc", xr.Dataset())
+    assert [(tmp_path / name).stat().st_size for name in ("cut.nc", "whole.nc")] == [100, 1000]

@@ -11,6 +11,7 @@ import threading
 import time
 from contextlib import closing, contextmanager
 from importlib.resources import files
+from unittest import mock
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -437,6 +438,18 @@ def test_a_message_that_is_sent_again_is_heard_once_and_one_of_another_window_is
     ]
     assert sent == [204, 204, 409, 204]
     assert call(gridworld, "POST", f"/{gridworld.token}/answer", body)[0] == 409
+    assert answers_of(gridworld) == ["first"]
+
+
+def test_an_answer_that_the_disk_does_not_take_is_refused_in_one_line_and_counts_once_when_it_does(gridworld):
+    gridworld.session.wait(timeout=60)
+    body = json.dumps({"turn": gridworld.session.view["turn"], "answer": "first"})
+    request = ("POST", f"/{gridworld.token}/answer", body)
+    with mock.patch.object(gridworld.session.learner.log, "append", side_effect=OSError("No space left on device")):
+        refused = call(gridworld, *request, **{"Idempotency-Key": "1"})
+    assert refused == (400, "your answer was not kept: No space left on device")
+    assert answers_of(gridworld) == []
+    assert [call(gridworld, *request, **{"Idempotency-Key": key})[0] for key in "22"] == [204, 204]
     assert answers_of(gridworld) == ["first"]
 
 

@@ -576,7 +576,9 @@ def test_a_run_that_the_command_line_cannot_continue_is_continued_in_python(tmp_
 def test_a_log_that_has_lost_iterations_is_not_called_intact(gridworld_copy):
     log = gridworld_copy / "events.jsonl"
     log.write_bytes(log.read_bytes()[:700])
-    found = {warning.what: warning.remedy for warning in warnings_of(read_contents(gridworld_copy))}
+    contents = read_contents(gridworld_copy)
+    assert contents.finished  # by the summary
+    found = {warning.what: warning.remedy for warning in warnings_of(contents)}
     lost = next(remedy for what, remedy in found.items() if "completed iterations, summary.json 3" in what)
     assert "the run cannot continue without it" in lost
     cut_off = next(remedy for what, remedy in found.items() if "last line is cut off" in what)
@@ -764,3 +766,16 @@ def test_a_report_of_a_swing_up_run_draws_the_utility_over_the_plane(swing_up_co
     assert "over the observed range" in text
     assert "could not be made" not in text
     assert path.stat().st_size < 2e6
+
+
+def test_a_run_whose_last_questions_were_all_skipped_is_not_called_finished(monkeypatch, tmp_path):
+    monkeypatch.setattr("bayespbrl.settings.settings.MOST_UNASKED", 2)
+    options = SHORT | {"utility": "linear-program", "answers": 9, "trajectories_per_iteration": 3}
+    learner = bayespbrl.start("gridworld", tmp_path / "run", **options)
+    while learner.state.iteration < 4:
+        learner.tell(["first" if learner.state.iteration < 2 else "skip"] * len(learner.ask()))
+    assert not learner.finished
+    contents = read_contents(tmp_path / "run")
+    given = [summary["answers"] for summary in contents.iterations]
+    assert given[0] < given[1] == given[2] == given[3]
+    assert not contents.finished

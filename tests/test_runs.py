@@ -1,8 +1,10 @@
 """A run on disk: what it holds, that it comes back bit for bit, and what happens to damaged ones."""
 
+import errno
 import json
 import multiprocessing
 import os
+import re
 import shutil
 import time
 from pathlib import Path
@@ -10,6 +12,7 @@ from unittest import mock
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -135,6 +138,12 @@ def test_the_policy_acts(finished):
     assert policy.act(np.int64(12), key=key) == policy.act(12, key=key) == policy(12, key=key)
 
 
+@pytest.mark.parametrize("observation", [np.zeros(3), [1], [[0, 1]]])
+def test_the_policy_refuses_an_observation_of_another_shape(finished, observation):
+    with pytest.raises(ValueError, match=r"observation: expected shape \(\), got \("):
+        bayespbrl.load(finished).policy.act(observation)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(2, start=1), gymnasium.spaces.Box(-1, 1, (1, 2))])
 def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):
@@ -204,6 +213,35 @@ def test_a_path_that_exists_is_refused_and_nothing_changed(tmp_path, finished, k
         start(path)
     assert contents(tmp_path) == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["taken"]
+
+
+def test_a_place_that_may_not_be_looked_at_is_refused(tmp_path, monkeypatch):
+    def forbidden(path, **options):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "exists", forbidden)
+        with pytest.raises(ValueError, match=r"run: expected a place where a run directory can be made, got .*denied"):
+            start(tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["drop_partial_line", "write_summary"])
+def test_a_run_that_cannot_be_written_is_not_resumed_but_loaded(copy, monkeypatch, what):
+    denied = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
+    monkeypatch.setattr(RunDirectory, what, denied)
+    before = contents(copy)
+    with pytest.raises(ValueError, match=r"copy: expected a run that can be written to, got .*Permission denied"):
+        runs.resume(copy)
+    bayespbrl.load(copy)
+    assert contents(copy) == before
+
+
+def test_a_log_that_cannot_be_read_is_named(copy, monkeypatch):
+    denied = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
+    monkeypatch.setattr(run_directory, "read_log_lines", denied)
+    with pytest.raises(ValueError, match=r"copy: events\.jsonl: expected a log that can be read, got .*denied"):
+        bayespbrl.load(copy)
 
 
 def test_bad_options_leave_nothing_behind(tmp_path):
@@ -369,7 +407,8 @@ def test_a_run_killed_between_any_two_writes_goes_on_as_if_it_had_not_been(tmp_p
         assert log.read_text().startswith(kept)
         summary = json.loads((path / "summary.json").read_text())
         assert (summary["finished"], len(summary["iterations"])) == (True, 3)
-        assert {file.name for file in path.iterdir()} <= FILES | {"summary.json.part"}
+        left = {file.name for file in path.iterdir()} - FILES
+        assert all(re.fullmatch(r"summary\.json\..*\.part", name) for name in left)
         shutil.rmtree(path)
 
 
@@ -577,6 +616,23 @@ def test_a_run_with_features_of_the_users_own_wants_them_again(tmp_path, answers
     np.testing.assert_array_equal(run.policy.table, whole.policy.table)
 
 
+@pytest.mark.parametrize("kind", [np.ndarray.tolist, lambda values: jnp.asarray(values, dtype=jnp.float32)])
+def test_features_that_are_lists_or_of_single_precision_give_the_same_utilities_after_loading(tmp_path, kind):
+    def features(states):
+        return kind(np.sin(np.outer(np.arange(25), [0.3, 0.7, 1.1]))[states])
+
+    learner = start(tmp_path / "run", features=features)
+    for _ in range(2):
+        learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    loaded = bayespbrl.load(tmp_path / "run", features=features)
+    states, trajectories = np.arange(25), learner.trajectories
+    assert learner.estimate.utilities(states).any()
+    np.testing.assert_array_equal(loaded.estimate.utilities(states), learner.estimate.utilities(states))
+    np.testing.assert_array_equal(
+        loaded.estimate.trajectory_utilities(trajectories), learner.estimate.trajectory_utilities(trajectories)
+    )
+
+
 def test_features_for_a_run_that_has_none_are_refused(finished):
     with pytest.raises(ValueError, match=r"expected no features=, got <function"):
         bayespbrl.load(finished, features=rows)
@@ -608,6 +664,17 @@ class Corridor(gymnasium.Env):
     def step(self, action):
         self.position += 1 if action == (self.np_random.random() < 0.8) else -1
         return self.position, float(self.position), self.position in (0, 6), False, {}
+
+
+@pytest.mark.parametrize("env", ["swing-up", Corridor()], ids=["box", "fewer states"])
+@pytest.mark.parametrize("read", [bayespbrl.load, runs.resume])
+def test_another_environment_than_the_runs_is_refused(copy, read, env):
+    before = contents(copy)
+    with pytest.raises(
+        ValueError, match=r"copy: states of the run: expected entries of (Box|Discrete)\(.*, got int64 of"
+    ):
+        read(copy, env=env)
+    assert contents(copy) == before
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """A sitting without a browser: turns, what is computed ahead, clips, the widget, and the command line around them."""
 
+import errno
 import io
 import json
 import subprocess
@@ -555,6 +556,30 @@ def test_the_widget_asks_and_tells_by_its_messages():
         widget.close()
     plain = bayespbrl.Learner("gridworld", expert="other", **QUICK).run(expert, answerer="Ada")
     assert fingerprint(session.learner) == fingerprint(plain)
+
+
+def test_the_widget_says_that_an_answer_was_not_kept_and_takes_it_when_it_can(directory):
+    learner = bayespbrl.resume(directory)
+    widget = learner.widget(answerer="Ada", practice=False)
+    try:
+        view, before, sent = widget.session.wait(timeout=WAIT), lines_of(directory), []
+        message = {"turn": view["turn"], "answer": "first"}
+        full = OSError(errno.ENOSPC, "No space left on device")
+        with mock.patch.object(widget, "send", sent.append):
+            with mock.patch.object(learner.log, "append", side_effect=full):
+                widget._handle_custom_msg(message, [])
+            say = "your answer was not kept: [Errno 28] No space left on device"
+            assert sent == [{"refused": view["turn"], "say": say}]
+            assert (lines_of(directory), widget.session.view) == (before, view)
+            widget._handle_custom_msg(message, [])
+            later = widget.session.wait(timeout=WAIT)["turn"]
+            with mock.patch.object(learner.log, "append", side_effect=full):
+                widget._handle_custom_msg({"turn": later, "answer": "undo"}, [])
+            assert sent[1:] == [{"refused": later, "say": say}]
+        assert learner.preferences.answers == 1
+        assert sum(line.startswith("answered") for line in lines_of(directory)) == 1
+    finally:
+        widget.close()
 
 
 def test_the_widget_begins_with_the_practice_for_a_person_new_to_the_run(directory):

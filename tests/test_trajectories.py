@@ -81,3 +81,19 @@ def test_what_is_not_finite_is_refused_by_name(name, bad):
     parts[name][-1] = bad
     with pytest.raises(ValueError, match=f"trajectory: {name}: expected finite entries, got NaN or infinity"):
         Trajectory(**parts)
+
+
+def test_lists_become_arrays():
+    given = Trajectory([[0.0], [1.0]], [[0.5]], [2.0])
+    for array, expected in ((given.states, [[0.0], [1.0]]), (given.actions, [[0.5]]), (given.rewards, [2.0])):
+        assert isinstance(array, np.ndarray)
+        np.testing.assert_array_equal(array, expected)
+    assert given.clip(0, 1).total_reward == 2.0
+
+
+@pytest.mark.parametrize("bad", [None, 3.0, "a", [["a"], ["b"]], [[0.0], [1.0, 2.0]], [None, None]], ids=str)
+@pytest.mark.parametrize("name", ["states", "actions", "rewards"])
+def test_what_is_no_array_of_numbers_is_refused_by_name(name, bad):
+    given = {"states": [[0.0], [1.0]], "actions": [[0.0]], "rewards": [0.0]} | {name: bad}
+    with pytest.raises(ValueError, match=f"trajectory: {name}: expected "):
+        Trajectory(**given)

@@ -11,7 +11,7 @@ from bayespbrl.features import OneHot, RadialBasis
 from bayespbrl.models import PreferenceModel
 from bayespbrl.models.likelihoods import Mixed, WithLapses, log_prob
 from bayespbrl.trajectories import Trajectory, trajectory_features, transitions
-from bayespbrl.utility import KnownReward, inference
+from bayespbrl.utility import KnownReward, infer_utility, inference
 from bayespbrl.utility.comparisons import Comparisons
 
 METHODS = ("posterior-mean", "most-likely", "posterior-draw", "linear-program")
@@ -342,6 +342,64 @@ def test_features_that_are_not_finite_are_refused():
     for method in METHODS:
         with pytest.raises(ValueError, match="finite"):
             estimate_utility(TRAJECTORIES, PAIRS, lambda s: ONE_HOT(s) * np.nan, method=method, discount=0.9)
+
+
+ITEMS = np.array([[2.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+BAD_ARGUMENTS = [
+    ({"feature_sums": [{1: 2}]}, "feature_sums: expected rows of numbers"),
+    ({"feature_sums": None}, "feature_sums: expected "),
+    ({"feature_sums": "abc"}, "feature_sums: expected rows of numbers"),
+    ({"feature_sums": [[1.0], [1.0, 2.0]]}, "feature_sums: expected rows of numbers"),
+    ({"pairs": None}, "pairs: expected pairs of integers, got None"),
+    ({"pairs": [(0.5, 1.7)]}, r"pairs: expected pairs of integers, got \[\(0.5, 1.7\)\]"),
+    ({"pairs": [(0, 1, 2)]}, "pairs: expected pairs of integers"),
+    ({"pairs": [(0, 1), (1,)]}, "pairs: expected pairs of integers"),
+    ({"pairs": [("a", "b")]}, "pairs: expected pairs of integers"),
+    ({"pairs": [0, 1]}, "pairs: expected pairs of integers"),
+    ({"pairs": [(0, 3)]}, "pairs: expected trajectory numbers in 0 … 2"),
+    ({"ties": None}, "ties: expected pairs of integers"),
+    ({"ties": [(0.0, 1.0)]}, "ties: expected pairs of integers"),
+    ({"discount": "x"}, r"discount: expected a number in \[0, 1\], got 'x'"),
+    ({"discount": 5}, r"discount: expected a number in \[0, 1\], got 5"),
+    ({"features": 3}, "features: expected a function of states"),
+    ({"seed": "x"}, "seed: expected a whole number >= 0"),
+    ({"answerers": ["a", "b"]}, "answerers: expected 1 whole numbers"),
+    ({"shown_first": [7]}, "shown_first: expected 1 whole numbers in -1 … 1"),
+    ({"lapse_rate": 7}, "lapse_rate: expected a number"),
+    ({"prior_scale": -1.0}, "prior_scale: expected a positive"),
+]
+
+
+@pytest.mark.parametrize("method", ["posterior-mean", "linear-program"])
+@pytest.mark.parametrize(("bad", "message"), BAD_ARGUMENTS, ids=[str(bad) for bad, _ in BAD_ARGUMENTS])
+def test_every_bad_argument_is_refused_by_name_whatever_the_method(method, bad, message):
+    arguments = {"feature_sums": ITEMS, "pairs": [(0, 1)]} | bad
+    with pytest.raises(ValueError, match=message):
+        infer_utility(arguments.pop("feature_sums"), arguments.pop("pairs"), method=method, **arguments)
+
+
+def test_pairs_may_be_an_array_and_states_and_features_may_be_lists():
+    given = infer_utility(ITEMS, [(0, 1), (2, 1)], method="linear-program")
+    as_array = infer_utility(ITEMS, np.array([[0, 1], [2, 1]], dtype=np.uint8), method="linear-program")
+    np.testing.assert_array_equal(as_array.weights, given.weights)
+    np.testing.assert_array_equal(given.utilities(ITEMS.tolist()), given.utilities(ITEMS))
+    own = infer_utility(ITEMS, [(0, 1), (2, 1)], method="linear-program", features=lambda states: states.tolist())
+    np.testing.assert_array_equal(own.utilities(ITEMS.tolist()), given.utilities(ITEMS))
+
+
+@pytest.mark.parametrize(
+    ("states", "message"),
+    [
+        (np.ones(2), r"states: expected shape \(N, D\), got \(2,\)"),
+        (np.full((1, 2), np.nan), "states: expected finite entries"),
+        (np.ones((1, 3)), "features: expected 2 for each state, as before, got 3"),
+        (None, "states: expected "),
+    ],
+)
+def test_states_that_are_no_feature_rows_are_refused(states, message):
+    estimate = infer_utility(ITEMS, [(0, 1)], method="linear-program")
+    with pytest.raises(ValueError, match=message):
+        estimate.utilities(states)
 
 
 def test_an_unknown_method_is_refused():

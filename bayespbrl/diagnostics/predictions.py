@@ -13,7 +13,8 @@ import xarray as xr
 from bayespbrl.models import NOTHING_ELSE, Answers, PreferenceModel, posterior_draws
 from bayespbrl.models.likelihoods import likelihood_of, smoothed_probability
 from bayespbrl.models.posterior import SamplerOptions
-from bayespbrl.models.posterior_tree import answers_of, bases_of, next_lapse_rates, settings_of
+from bayespbrl.models.posterior_tree import answers_of, bases_of, next_lapse_rates, number_of_preferences, settings_of
+from bayespbrl.utility.posterior_utility import spacing
 
 PREFERRED, DOMINATED, TIED = 0, 1, 2
 MOST_DRAWS = 2000  # a probability is then known to a hundredth
@@ -76,7 +77,7 @@ PARAMETERS = ("steepness", "lapse_rate", "tie_threshold")
 def _every(tree: xr.DataTree) -> dict[str, np.ndarray]:
     """Draws of all chains, thinned, along the first axis."""
     drawn = tree.children["posterior"].dataset
-    apart = -(-drawn["setting"].size // MOST_DRAWS)
+    apart = spacing(drawn["setting"].size, MOST_DRAWS)
     names = [name for name in ("setting", "coordinates", *PARAMETERS) if name in drawn]
     parts = {name: drawn[name].values[:, ::apart] for name in names}
     parts["lapse_rates"], parts["lapse_rate"] = parts["lapse_rate"], next_lapse_rates(tree)[:, ::apart]
@@ -130,11 +131,6 @@ def fitted_model(tree: xr.DataTree) -> PreferenceModel:
     for name, value in options.items():
         options[name] = None if value != value else value  # NaN: inferred
     return PreferenceModel(**options)
-
-
-def number_of_preferences(tree: xr.DataTree) -> int:
-    """K of eq. 8 in a tree's model."""
-    return max(int(tree.attrs["number_of_preferences"]), 1)
 
 
 def tied_rows(tree: xr.DataTree) -> np.ndarray:

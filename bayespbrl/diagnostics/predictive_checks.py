@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 
 from bayespbrl import checks
 from bayespbrl.models.likelihoods import likelihood_of, prob
-from bayespbrl.models.posterior_tree import answers_of, settings_of
+from bayespbrl.models.posterior_tree import answers_of, number_of_preferences, settings_of
+from bayespbrl.utility.posterior_utility import spacing
 
 CHECKS = ("surprises", "cycles", "ties")
 MOST_ANSWERS_IN_TRIADS = 120  # of more, triads are looked for among the first only
@@ -39,7 +40,7 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
     """
     drawn = tree.children["posterior"].dataset
     number = tree.children["constant_data"].sizes["preference"]
-    every = slice(None, None, -(-drawn["setting"].size // checks.whole("draws", draws)))
+    every = slice(None, None, spacing(drawn["setting"].size, checks.whole("draws", draws)))
     margins = drawn["margins"].values.reshape(drawn["setting"].size, number)[every]
     tied = np.asarray(tree.children["observed_data"]["answers"]) == 0
     given = np.where(tied, 0, 1)[None]
@@ -73,7 +74,7 @@ def _simulated(
     lapse_rates = drawn["lapse_rate"].values.reshape(size, -1)[every][:, who]
     likelihood = likelihood_of(
         tree.attrs["likelihood"],
-        float(max(tree.attrs["number_of_preferences"], 1)),
+        float(number_of_preferences(tree)),
         steepness=drawn["steepness"].values.reshape(-1, 1)[every],
         lapse_rate=lapse_rates,
         tie_threshold=drawn["tie_threshold"].values.reshape(-1, 1)[every] if "tie_threshold" in drawn else None,

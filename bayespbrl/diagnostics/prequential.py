@@ -12,7 +12,7 @@ from scipy.special import xlog1py, xlogy
 from bayespbrl import checks
 from bayespbrl.diagnostics import predictions
 from bayespbrl.models import NOTHING_ELSE, Answers, PreferenceModel
-from bayespbrl.models.posterior_tree import answers_of, settings_of
+from bayespbrl.models.posterior_tree import answers_of, number_of_preferences, settings_of
 
 
 def prequential_predictions(
@@ -92,7 +92,7 @@ def calibration(
     first_preferred = checks.flags("first_preferred", first_preferred, number)
     groups = predictions.answer_groups(groups, number)
     if predicted is None:
-        options = {"seed": int(tree.attrs["seed"]), "number_of_preferences": predictions.number_of_preferences(tree)}
+        options = {"seed": int(tree.attrs["seed"]), "number_of_preferences": number_of_preferences(tree)}
         options |= sampling_options
         predicted = prequential_predictions(
             differences,

@@ -118,6 +118,11 @@ def answers_of(tree: xr.DataTree) -> Answers:
     return Answers(tied if "tie_threshold" in drawn else None, **parts, names=names)
 
 
+def number_of_preferences(tree: xr.DataTree) -> int:
+    """K of eq. 8 in a tree's model, at least 1."""
+    return max(int(tree.attrs["number_of_preferences"]), 1)
+
+
 def next_lapse_rates(tree: xr.DataTree) -> Float[np.ndarray, "chain draw"]:
     """The lapse rate of an answer by one of the answerers, each as probable as their share of the answers.
 

@@ -90,7 +90,8 @@ class Seat:
 
         Raises:
           Stale: the turn or the session is over, or the question is not there yet; nothing has happened.
-          ValueError: no answer, a bad time or number of replays, or nothing to take back; nothing has happened.
+          ValueError: no answer, a bad time or number of replays, nothing to take back, or a log that cannot be written;
+            nothing has happened.
         """
         self.session.take(self, turn, answer, seconds, replays)
 

@@ -171,14 +171,14 @@ class Session:
         if not seat.view["undo"]:
             raise ValueError("undo: expected an answer by the same person to take back, got none")
         number = self.learner.state.past[-1].number
-        self.learner.undo(answerer=seat.answerer)
+        self._record(events.undone(seat.answerer))
         self._turn(seat)
         self._foresight.back(number, self.learner.state, seat.answerer)
 
     def _take(self, seat: Seat, answer: str, how: dict[str, Any]) -> None:
         number, given = seat.number, parse_answer(answer)
         assert number is not None
-        self.learner.record(events.answered(number, given, answerer=seat.answerer, session=self.name, **how))
+        self._record(events.answered(number, given, answerer=seat.answerer, session=self.name, **how))
         self._turn(seat)
         moment = self._foresight.move(number, given, self.learner.state)
         try:
@@ -188,6 +188,13 @@ class Session:
                 self.learner.record(entry)
         except Exception as error:  # a full disk, or another learner in the run: this answer is kept all the same
             self._failed(moment, error)
+
+    def _record(self, entry: Entry) -> None:
+        """Keep what a person said; `ValueError` where the disk is full or read-only. Nothing has happened then."""
+        try:
+            self.learner.record(entry)
+        except OSError as error:
+            raise ValueError(f"your answer was not kept: {' '.join(str(error).split())}") from error
 
     # The thread that thinks.
 

@@ -36,7 +36,13 @@ class Actor:
     observation_shape: tuple[int, ...] = ()
 
     def act(self, observation: Any, *, key: Key[Array, ""] | None = None) -> Any:
-        """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete."""
+        """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete.
+
+        Raises:
+          ValueError: an observation of another shape.
+        """
+        if (shape := np.asarray(observation).shape) != self.observation_shape:
+            raise ValueError(f"observation: expected shape {self.observation_shape}, got {shape}")
         return self._drawn(self.policy, observation, key)
 
     __call__ = act

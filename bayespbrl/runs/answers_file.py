@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from bayespbrl import checks
-from bayespbrl.preferences import Answer, PastQuestion, parse_answer
+from bayespbrl.preferences import Answer, PastQuestion
 from bayespbrl.runs.files import write_file
 
 COLUMNS = ("question", "first", "second", "answer", "answerer", "seconds", "repeats", "session", "replays")
 NEEDED = ("first", "second", "answer")
+GIVEN = [str(answer) for answer in Answer if answer is not Answer.UNDO]
 
 
 class CollectedAnswers(NamedTuple):
@@ -60,14 +61,16 @@ def read_answers(file: Path | str) -> CollectedAnswers:
 
     Args:
       file: with a head and at least the columns `first`, `second` (whole numbers from 0, in the order shown) and
-        `answer`; `answerer` is read where it is there. Rows with the answer skip are left out.
+        `answer`; `answerer` is read where it is there. Rows with the answer skip are left out. A byte-order mark, as
+        Excel writes it, and spaces around a cell do no harm.
 
     Raises:
-      ValueError: a file that cannot be read, a missing column, or a bad row, by its line.
+      ValueError: a file that cannot be read, a missing column, or a bad cell, by its line and column.
     """
     file = Path(file)
     try:
-        lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8"), newline=""))
+        lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig"), newline=""))
+        lines.fieldnames = [name.strip() for name in lines.fieldnames or ()]
         if not set(NEEDED) <= set(lines.fieldnames or ()):
             raise ValueError(
                 f"expected the columns {', '.join(NEEDED)}, got {', '.join(lines.fieldnames or ()) or 'none'}"
@@ -86,10 +89,18 @@ def read_answers(file: Path | str) -> CollectedAnswers:
 
 def _row(line: dict[str, str | None], number: int) -> tuple[int, int, Answer, str]:
     try:
-        first, second = (checks.whole(name, int(line[name] or ""), 0) for name in ("first", "second"))
-        answer, name = parse_answer(line["answer"]), line.get("answerer") or ""
-        if first == second or answer is Answer.UNDO:
-            raise ValueError(f"expected an answer about two different things, got {line['answer']!r} about {first}")
-        return first, second, answer, checks.short_name("answerer", name) if name else ""
+        first, second = (_row_number(name, line[name]) for name in ("first", "second"))
+        if first == second:
+            raise ValueError(f"second: expected another number than first, got {second} twice")
+        answer = Answer(checks.one_of("answer", (line["answer"] or "").strip(), GIVEN))
+        name = line.get("answerer") or ""
+        return first, second, answer, checks.short_name("answerer", name.strip() or name) if name else ""
     except ValueError as error:
         raise ValueError(f"line {number}: {error}") from None
+
+
+def _row_number(column: str, cell: str | None) -> int:
+    text = (cell or "").strip()
+    if not text.isdecimal():
+        raise ValueError(f"{column}: expected a whole number >= 0, got {text!r}")
+    return int(text)

@@ -44,10 +44,10 @@ class RunDirectory:
           ValueError: the path exists, or cannot be written.
         """
         path = Path(path)
-        if path.exists() or path.is_symlink():
-            raise ValueError(f"{path}: expected a run directory that does not exist yet, got one that exists")
         content = {"format": FORMAT, "version": version("bayespbrl"), "env": settings.env, **settings.options()}
         try:
+            if path.exists() or path.is_symlink():
+                raise ValueError(f"{path}: expected a run directory that does not exist yet, got one that exists")
             path.parent.mkdir(parents=True, exist_ok=True)
             building = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
             try:
@@ -138,7 +138,11 @@ class RunDirectory:
             yield Entry(event, parts)
 
     def _events(self) -> Iterator[Event]:
-        for event in read_log_lines(self.log_file):
+        try:
+            lines = read_log_lines(self.log_file)
+        except OSError as error:
+            raise ValueError(f"events.jsonl: expected a log that can be read, got {error}") from error
+        for event in lines:
             if isinstance(event, PartialLine):
                 return
             if isinstance(event, ValueError):

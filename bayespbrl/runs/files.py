@@ -1,9 +1,12 @@
 """Atomic files: written aside, flushed, renamed into place."""
 
 import os
+import re
+import secrets
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import netCDF4
@@ -13,15 +16,19 @@ from xarray.backends import NetCDF4DataStore
 NETCDF = threading.Lock()  # to hold while a netCDF file is read or written: the library serves one thread at a time
 
 
+ASIDE = re.compile(r".\.\d+-[0-9a-f]{8}\.part$")  # what is written, beside the file that it will be
+STALE = 3600.0  # seconds without a change after which a file aside is what a killed process left
+
+
 @contextmanager
 def written_aside(file: Path) -> Iterator[Path]:
     """A path beside `file` to write to; it becomes `file` when the block ends.
 
-    Where the block raises, `file` is as it was and nothing is left beside it.
+    Where the block raises, `file` is as it was and nothing is left beside it. Of several writers the last to end wins.
     """
-    aside = file.with_name(file.name + ".part")
+    aside = file.with_name(f"{file.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
+    _drop_stale(file.parent)
     try:
-        aside.unlink(missing_ok=True)  # HDF5 refuses a file that a killed process left open
         yield aside
         with aside.open("r+b") as written:
             os.fsync(written.fileno())
@@ -31,6 +38,15 @@ def written_aside(file: Path) -> Iterator[Path]:
         if isinstance(error, OSError) and error.errno is not None and error.filename is None:  # a full disk
             raise OSError(error.errno, error.strerror, str(file)) from error
         raise
+
+
+def _drop_stale(directory: Path) -> None:
+    """Delete what killed processes left in a directory, where that is possible."""
+    with suppress(OSError):
+        for entry in os.scandir(directory):
+            with suppress(OSError):  # another process deletes it too
+                if ASIDE.search(entry.name) and time.time() - entry.stat().st_mtime > STALE:
+                    os.unlink(entry.path)
 
 
 def write_netcdf(file: Path, data: xr.Dataset | xr.DataTree) -> None:
@@ -47,8 +63,17 @@ def write_netcdf(file: Path, data: xr.Dataset | xr.DataTree) -> None:
                 node.to_dataset(inherit=False).dump_to_store(NetCDF4DataStore(group))
         finally:
             content = opened.close()
-    # the buffer has room to spare; the superblock says where the file ends (HDF5 file format, versions 2 and 3)
-    write_file(file, content[: int.from_bytes(content[28:36], "little")])
+    write_file(file, content[: _end_of(content)])
+
+
+def _end_of(content: memoryview) -> int:
+    """Where an HDF5 file ends in a buffer with room to spare.
+
+    That is the end of the buffer where the superblock is of an unknown kind: bytes after its end do a file no harm.
+    """
+    if content[8] not in (2, 3) or content[9] != 8:  # version, and bytes of an address (HDF5 file format)
+        return len(content)
+    return int.from_bytes(content[28:36], "little")
 
 
 def write_file(file: Path, content: str | bytes | memoryview) -> None:

@@ -56,7 +56,8 @@ def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
     """Pictures of one episode that the environment renders, and the milliseconds for which to show each."""
     env, settings = rendering(learner.environment), learner.settings
     limit = rollouts.step_limit(learner.environment, settings.rollouts.max_steps)
-    actor = Actor(learner.policy, env.action_space, np.random.default_rng(settings.seed))
+    shape, rng = env.observation_space.shape or (), np.random.default_rng(settings.seed)
+    actor = Actor(learner.policy, env.action_space, rng, observation_shape=shape)
     stride = 1
     try:
         observation, _ = env.reset(seed=settings.seed)

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import rollouts
-from bayespbrl.envs.opening import AnyEnvironment, from_plain, imported_by_name, to_plain
+from bayespbrl.envs.opening import AnyEnvironment, check_of_space, from_plain, imported_by_name, to_plain
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
@@ -65,14 +65,17 @@ def resume(
         may be a stranger's, and importing runs code.
 
     Raises:
-      ValueError: a package that may not be imported; a directory that is no run, or a file in it that is truncated
-        or foreign.
+      ValueError: a package that may not be imported; an environment with other states or actions than the run's; a
+        directory that is no run or cannot be written, or a file in it that is truncated or foreign.
     """
     log = RunDirectory.open(directory)
     _check_import(log, env, import_package)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
-    log.drop_partial_line()
-    log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
+    try:
+        log.drop_partial_line()
+        log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
+    except OSError as error:
+        raise ValueError(f"{log.path}: expected a run that can be written to, got {error}") from error
     return learner.logged(log)
 
 
@@ -121,6 +124,9 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
     try:
         learner = Learner(settings.env if env is None else env, **own, entries=entries, kept=settings)
         log.check_complete(learner.state, summarised)
+        for trajectory in learner.trajectories:  # of another environment, where env= is a wrong one
+            check_of_space("states of the run", trajectory.states, learner.environment.observation_space)
+            check_of_space("actions of the run", trajectory.actions, learner.environment.action_space)
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
     return learner

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 from xarray import DataTree
 
 from bayespbrl import checks
-from bayespbrl.features import StateFeatures
+from bayespbrl.features import DiffusionBasis, RadialBasis, StateFeatures, checked_features
 from bayespbrl.models import Answers, PreferenceModel, linear_program, plain_chain, plain_draws, posterior_draws
 from bayespbrl.models.posterior_tree import bases_of
 from bayespbrl.trajectories import DISCOUNT
@@ -118,18 +119,21 @@ def infer_utility(
       seed: of the sampler.
 
     Raises:
-      ValueError: an unknown method, feature sums that are no finite matrix, pairs that name no row.
+      ValueError: an unknown method, feature sums that are no finite matrix, pairs that name no row, and any other
+        argument that is not as above, whether the method uses it or not.
     """
     checks.one_of("method", method, (*POSTERIOR_METHODS, "linear-program"))
-    tied = np.arange(len(pairs) + len(ties)) >= len(pairs)
-    comparisons = Comparisons(
-        (), (*pairs, *ties), discount, Answers(tied if tied.any() else None, shown_first, answerers)
-    )
+    checks.whole("seed", seed, 0)
     sums = checks.matrix("feature_sums", feature_sums)
-    chosen = _as_they_are if features is None else features
+    every = np.concatenate([checks.pairs("pairs", pairs), checks.pairs("ties", ties)])
+    tied = np.arange(len(every)) >= len(pairs)
+    answers = Answers(tied if tied.any() else None, shown_first, answerers).checked(len(every))
+    numbers = tuple((first, second) for first, second in every.tolist())
+    comparisons = Comparisons((), numbers, checks.share("discount", discount), answers)
+    chosen = _as_they_are if features is None else _checking(features)
+    model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold)
     if method == "linear-program":
         return _by_linear_program(sums, comparisons, chosen)
-    model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold)
     unscaled = settings(chosen, inferred=False, rng=np.random.default_rng(0))
     return _by_posterior([sums], unscaled, comparisons, chosen, method, model, seed)
 
@@ -193,5 +197,12 @@ def _parts(tree: DataTree, method: str, seed: int) -> np.ndarray:
     return parts
 
 
-def _as_they_are(features: np.ndarray) -> np.ndarray:
-    return features
+def _as_they_are(states: np.ndarray) -> np.ndarray:
+    return checks.matrix("states", states)
+
+
+def _checking(features: StateFeatures) -> StateFeatures:
+    """φ of the user's with its values checked; ours check themselves, and their bandwidths are read."""
+    if not callable(features):
+        raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
+    return features if isinstance(features, RadialBasis | DiffusionBasis) else partial(checked_features, features)

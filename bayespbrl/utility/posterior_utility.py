@@ -11,7 +11,7 @@ from xarray import DataTree
 from bayespbrl import checks
 from bayespbrl.features import StateFeatures, linear
 from bayespbrl.models.likelihoods import Likelihood, likelihood_of
-from bayespbrl.models.posterior_tree import next_lapse_rates
+from bayespbrl.models.posterior_tree import next_lapse_rates, number_of_preferences
 from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.length_scales import rescaled, sums_under, values_under
 from bayespbrl.utility.quality import FitQuality
@@ -70,7 +70,7 @@ class PosteriorUtility:
         )
         return likelihood_of(
             fitted["likelihood"],
-            float(max(fitted["number_of_preferences"], 1)),
+            float(number_of_preferences(self.posterior)),
             steepness=steepness,
             lapse_rate=lapse_rate,
         )

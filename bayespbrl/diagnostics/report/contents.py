@@ -45,6 +45,7 @@ class RunContents:
       features_missing: why the estimate's φ, a function of the user's, cannot be used; empty where it can.
       environment: opened; None where it cannot be.
       open_question: number of the question that waits for an answer.
+      finished_by_log: whether the run is finished; None where `summary.json` holds more iterations than the log.
       damage: one warning for each thing that cannot be read.
     """
 
@@ -61,11 +62,17 @@ class RunContents:
     features_missing: str = ""
     environment: gymnasium.Env | None = None
     open_question: int | None = None
+    finished_by_log: bool | None = None
     damage: tuple[ReportWarning, ...] = ()
 
     @property
     def finished(self) -> bool:
-        """Whether all iterations are completed."""
+        """Whether the run is finished.
+
+        By the summaries alone, an iteration whose questions were all skipped counts as one without a question.
+        """
+        if self.finished_by_log is not None:
+            return self.finished_by_log
         answers = [summary.get("answers", 0) for summary in self.iterations]  # none in a damaged summary
         unasked = next((n for n, before in enumerate(reversed(answers[:-1])) if before != answers[-1]), 0)
         return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked, self.started)
@@ -138,6 +145,7 @@ def read_contents(
         preferences=log.state.preferences,
         clips=log.state.clips,
         open_question=None if log.state.query is None else log.state.query.number,
+        finished_by_log=log.state.finished(run.settings) if len(log.summaries) <= log.state.iteration else None,
         damage=log.damage,
     )
     contents = _with_environment(contents, env, import_package)

@@ -26,12 +26,12 @@ class AnsweredQuestion:
 
     Attributes:
       question: its number, from 1.
-      iteration: in which it was asked, from 1.
+      iteration: in which it was answered, from 1; of several people, one may answer a question of an earlier iteration.
       first, second: numbers of the two trajectories in the order shown.
       answer: the expert's.
       row: which of the K ordered pairs it is; None where it gave none (a tie, a skip).
-      predicted: probability that the first is preferred, by the estimate that the learner had when it asked; NaN where
-        that has no posterior or cannot be read.
+      predicted: probability that the first is preferred, by the estimate that the learner had when it was answered; NaN
+        where that has no posterior or cannot be read.
       answerer, seconds: who answered, and how long they took; None where that is not known.
     """
 

@@ -121,7 +121,7 @@ def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
         ["log score less its expectation, in standard deviations (z)", cell(float(scores["log_score_z"])), "0 ± 1"]
     )
     rows += [[name, number(float(scores[name])), ""] for name in ("miscalibration", "discrimination", "uncertainty")]
-    caption = "Each answer was predicted by the posterior that the learner had when it asked. 0 is the best score."
+    caption = "Each answer was predicted by the last posterior before it. 0 is the best score."
     table = Table(caption, ["", "score", "expected if calibrated"], rows)
     curve = drawn(
         "calibration",

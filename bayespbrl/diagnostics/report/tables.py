@@ -54,7 +54,7 @@ def answers_table(contents: RunContents) -> xr.Dataset:
 
     Returns:
       `question`, `iteration`, `first`, `second`, `said`, the answer; `before`, its probability by the estimate that the
-      learner had when it asked; `probability`, the same by the last posterior, which has seen the answer (NaN for a tie
+      learner had by then; `probability`, the same by the last posterior, which has seen the answer (NaN for a tie
       or a skip, and for answers after the last estimate that can be read); `margin`, the utility of the preferred one
       less that of the other by the last estimate, and its posterior standard deviation `margin_sd`.
     """
