@@ -266,10 +266,9 @@ class Learner:
             vain = vain + 1 if answer is Answer.UNDO and self.state.previous is None else 0
             if vain == VAIN_UNDOS:
                 raise ValueError(f"expert: expected an answer, because there is none to take back, got {vain} undos")
-            if vain:
-                continue  # the same question again
-            self._take_in([query], [answer], answerer, seconds)
-            self._advance(progress)
+            if not vain:  # else the same question again
+                self._take_in([query], [answer], answerer, seconds)
+                self._advance(progress)
         return self
 
     def _question_for(self, answerer: str | None, progress: Callable[["Learner"], None] | None) -> Query | None:
@@ -305,9 +304,7 @@ class Learner:
         try:
             from bayespbrl.people.widget import ComparisonWidget  # here, since people stand above the learner
         except ImportError as error:
-            raise ValueError(
-                f"widget: expected the extra people (pip install '.[people]' in the checkout), got {error}"
-            ) from error
+            raise ValueError(f"widget: expected the extra people (pip install '.[people]'), got {error}") from error
         return ComparisonWidget(self, most_answers=answers, answerer=answerer, practice=practice)
 
     def _waiting(self) -> list[Query]:
@@ -338,8 +335,7 @@ class Learner:
 def task_of(environment: gymnasium.Env, max_steps: int | None = None) -> Task:
     """The properties of a task that the default preset depends on; `ValueError` where no time limit is known."""
     horizon = rollouts.step_limit(environment, max_steps)
-    steps_at_first = partial(random_steps, environment)
-    return Task(environment.observation_space, environment.action_space, horizon, steps_at_first)
+    return Task(environment.observation_space, environment.action_space, horizon, partial(random_steps, environment))
 
 
 Choice = TypeVar("Choice")

@@ -107,9 +107,7 @@ def check_page_installed() -> None:
     try:
         from bayespbrl.people import page  # noqa: F401
     except ImportError as error:
-        raise ValueError(
-            f"page: expected the extra people (pip install '.[people]' in the checkout), got {error}"
-        ) from error
+        raise ValueError(f"page: expected the extra people (pip install '.[people]'), got {error}") from error
 
 
 def show_run(learner: Learner, directory: Path) -> None:

@@ -66,7 +66,7 @@ def random_steps(env: gymnasium.Env, most: int) -> float:
     space = deepcopy(env.action_space)
     space.seed(0)
 
-    def act(_: int, observations: Rows) -> Rows:
+    def act(first: int, step: int, observations: Rows) -> Rows:
         return np.stack([np.asarray(space.sample()) for _ in observations])
 
     drawn = episodes_by_interface(env, act, seeds=0, episodes=PROBES, steps=most)

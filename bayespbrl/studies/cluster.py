@@ -20,9 +20,7 @@ def scheduler_executor(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise ValueError(
-            f"scheduler: expected the extra cluster (pip install '.[cluster]' in the checkout), got {error}"
-        ) from error
+        raise ValueError(f"scheduler: expected the extra cluster (pip install '.[cluster]'), got {error}") from error
     try:
         client = Client(address, timeout=WAIT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
