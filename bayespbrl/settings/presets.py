@@ -161,8 +161,8 @@ class Task:
     def more_trajectories(self) -> dict[str, Any]:
         """More trajectories an iteration where the first episodes of a task with continuous actions end at once.
 
-        Decision: as many as have `LEAST_STEPS` steps, but at most `MOST_TRAJECTORIES`; with ten of four steps each,
-        InvertedPendulum is not learned.
+        Decision: as many as have `LEAST_STEPS` steps, but at most `MOST_TRAJECTORIES`; from ten of four steps each
+        nothing is learned about InvertedPendulum.
         """
         if self.steps_at_first is None or not isinstance(self.action_space, Box):
             return {}
