@@ -108,12 +108,11 @@ class Chains:
         rng = np.random.default_rng(seed)
         # likely settings, but spread wider than the posterior over them: chains that agree have forgotten their start
         setting = rng.choice(len(fits), num_chains, p=softmax([0.5 * fit.log_evidence for fit in fits]))
-        unknowns = Unknowns(*map(jnp.asarray, (setting, *prior_draws(problem, rng, num_chains))))
+        unknowns = Unknowns(*jax.device_put((setting, *prior_draws(problem, rng, num_chains))))
         wider = np.asarray(reference_scale(problem, unknowns))[..., None]
         centres, roots = np.asarray(problem.settings.centre)[setting], np.asarray(problem.settings.root)[setting]
-        start = jnp.asarray(wider * (centres + np.einsum("cij,cj->ci", roots, rng.standard_normal(centres.shape))))
-        zeros = jnp.zeros(num_chains)
-        no = zeros.astype(bool)
+        start = wider * (centres + np.einsum("cij,cj->ci", roots, rng.standard_normal(centres.shape)))
+        start, zeros, no = jax.device_put((start, np.zeros(num_chains), np.zeros(num_chains, bool)))
         keys = jax.random.split(jax.random.key(seed), num_chains)
         state = EllipticalSliceState({"utility_weights": start}, zeros, zeros, no, no, keys)
         steps = steps_of(fits, problem) if _flies(problem.settings) else None
@@ -193,16 +192,17 @@ def joint_problem(fits: Sequence[GaussianFit], by_answerer: Float[np.ndarray, "a
     one_hot[:, :number] = known
 
     def table(prior: Grid) -> Table:
-        return Table(jnp.asarray(prior.values), jnp.log(jnp.asarray(prior.probabilities)))
+        values, probabilities = jax.device_put((np.asarray(prior.values), np.asarray(prior.probabilities)))
+        return Table(values, jnp.log(probabilities))
 
     scaled = len(fits[0].differences) > FEW and model.steepness is None and not has_steps(likelihood)
     return JointProblem(
         stacked(problems),
-        jnp.full(len(fits), -np.log(len(fits))),
+        jax.device_put(np.full(len(fits), -np.log(len(fits)))),
         table(model.steepness_prior),
         table(model.lapse_rate_prior),
         table(model.tie_threshold_prior if ties_of(likelihood) is not None else given(0.0)),
-        jnp.asarray(one_hot),
+        jax.device_put(one_hot),
         model.steepness_prior.mean if scaled else None,
     )
 

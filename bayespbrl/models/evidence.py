@@ -39,7 +39,8 @@ def log_evidence(chains: Chains, length: int, *, seed: int) -> tuple[float, floa
     together = [np.concatenate([a.reshape(rows, *a.shape[2:]), b]) for a, b in zip(drawn, of_proposal, strict=True)]
     with jax.enable_x64(True):
         points = np.concatenate([z.reshape(rows, rank), proposed])
-        ratios = np.asarray(_log_ratios(chains.problem, jnp.asarray(points), Unknowns(*map(jnp.asarray, together))))
+        points, together = jax.device_put((points, together))
+        ratios = np.asarray(_log_ratios(chains.problem, points, Unknowns(*together)))
     of_posterior = ratios[:rows].reshape(z.shape[:2])
     relative = float(np.min(chain_convergence(of_posterior[..., None]).effective_sample_size)) / rows
     return _bridged(ratios[:rows], ratios[rows:], min(relative, 1.0))
@@ -74,7 +75,7 @@ def _proposed(
     for number, root in enumerate(np.asarray(problem.settings.root)):
         chosen = setting == number
         points[chosen] += noise[chosen] @ root.T
-    return points * np.asarray(reference_scale(problem, Unknowns(*map(jnp.asarray, unknowns))))[..., None], unknowns
+    return points * np.asarray(reference_scale(problem, Unknowns(*jax.device_put(unknowns))))[..., None], unknowns
 
 
 @jax.jit

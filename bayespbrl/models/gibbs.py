@@ -239,5 +239,5 @@ def likelihood_with(template: Any, point: Point) -> Any:
 
 def stacked(problems: Sequence[PreferenceProblem]) -> PreferenceProblem:
     """Problems of one capacity as one with a leading axis; likelihood and prior scale are the first's."""
-    arrays: dict[str, Any] = {name: jnp.stack([getattr(each, name) for each in problems]) for name in STACKED}
-    return problems[0]._replace(**arrays)
+    arrays: dict[str, Any] = {name: np.stack([getattr(each, name) for each in problems]) for name in STACKED}
+    return problems[0]._replace(**jax.device_put(arrays))

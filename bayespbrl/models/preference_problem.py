@@ -8,6 +8,7 @@ Arrays are padded, so that problems of different size share a compilation.
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
@@ -179,7 +180,8 @@ def padded_problem(
         # A is lower triangular, as L is: whitened coordinates mean alike under different features
         inverse_root[:rank, :rank] = np.linalg.cholesky(precision[::-1, ::-1])[::-1, ::-1].T
         root[:rank, :rank] = np.linalg.inv(inverse_root[:rank, :rank])
-    arrays = [jnp.asarray(a) for a in (padded, used, centre, precisions, root, inverse_root)]
+    # not by jnp.asarray, which compiles a program for each shape
+    arrays = jax.device_put((padded, used, centre, precisions, root, inverse_root))
     return PreferenceProblem(
         arrays[0], arrays[1], _padded_likelihood(likelihood, capacity), float(prior_scale), *arrays[2:]
     )
