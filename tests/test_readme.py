@@ -51,3 +51,17 @@ def test_every_link_to_a_file_leads_somewhere(page):
         target = page.parent / path if path else page
         assert target.exists(), link
         assert not anchor or anchor in anchors(target), link
+
+
+def test_every_reference_is_cited_by_author_and_year_where_the_page_says():
+    entries = [line for line in (ROOT / "docs" / "references.md").read_text().splitlines() if line.startswith("* ")]
+    assert len(entries) > 50
+    for entry in entries:
+        work, _, citing = entry.partition("Cited in")
+        author, year = re.match(r"\* ([^,]+),", work)[1], re.search(r"\((\d{4})", work)[1]
+        files = re.findall(r"\]\(\.\./([^)]+)\)", citing)
+        assert files, entry
+        for file in files:
+            text = (ROOT / file).read_text()
+            assert author in text, f"{author} in {file}"
+            assert year in text, f"{author} {year} in {file}"
