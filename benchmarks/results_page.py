@@ -9,10 +9,13 @@ each, as `bayespbrl study` and `bayespbrl results` leave them).
 
 import argparse
 import difflib
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -103,20 +106,19 @@ def cheapest(data: StudyData) -> RowData | None:
     return min(learned, key=lambda row: float(row.lines["seconds"].sum() / len(row.seeds)), default=None)
 
 
-def again(row: RowData) -> list[dict[str, Any]]:
-    """The iterations of the first trial of a row, run anew."""
+def again(row: RowData, processes: Executor) -> list[dict[str, Any]]:
+    """The iterations of the first trial of a row, run anew in one of the processes."""
     seed = row.seeds[0]
     with tempfile.TemporaryDirectory() as folder:
         learner = row_of(row.declared.env, Path(folder) / "row", row.declared.options, seed=seed)
         cell = replace(learner, baseline=row.declared.baseline)
-        with trial_processes(1) as process:  # with as many threads as in a study: others round sums otherwise
-            process.submit(run_trial, cell, seed).result()
+        processes.submit(run_trial, cell, seed).result()
         entries: list[dict[str, Any]]
         entries = (read_summary if cell.baseline is None else read_baseline)(cell.path(seed))["iterations"]
         return entries
 
 
-def differences_of_a_cell(data: StudyData) -> list[str]:
+def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
     """What differs where the first trial of the cheapest row is run again; empty where nothing does.
 
     A study of another version is not run again: it would differ. Another processor or library rounds sums otherwise,
@@ -125,7 +127,7 @@ def differences_of_a_cell(data: StudyData) -> list[str]:
     row = cheapest(data)
     if row is None or data.description.get("version") != version("bayespbrl"):
         return []
-    seed, entries = row.seeds[0], again(row)
+    seed, entries = row.seeds[0], again(row, processes)
     kept = row.lines[row.lines["seed"] == seed]
     where = f"study {data.name}, {row.declared.name}, seed {seed}"
     found = [
@@ -150,8 +152,11 @@ def check(studies: dict[str, StudyData], page_file: Path = PAGE) -> list[str]:
     found = list(
         difflib.unified_diff(kept, page(studies).splitlines(), "RESULTS.md", "from the data", lineterm="", n=0)
     )
-    for data in studies.values():
-        found += differences_of_a_cell(data)
+    # with as many threads of linear algebra as in a study: others round sums otherwise
+    cores = os.cpu_count() or 1
+    with trial_processes(cores) as processes, ThreadPoolExecutor(cores) as threads:
+        for differences in threads.map(partial(differences_of_a_cell, processes=processes), studies.values()):
+            found += differences
     return found
 
 

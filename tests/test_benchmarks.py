@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -187,7 +188,7 @@ def test_results_follow_from_the_committed_data_and_a_changed_figure_is_found(tm
     assert "-99999" not in text
     figure = r"\| -9\d\d(\.\d)? \|"  # of the SwingUp
     changed.write_text(re.sub(figure, "| -99999 |", text, count=1))
-    page.differences_of_a_cell = lambda data: []  # run again in the test below
+    page.differences_of_a_cell = lambda data, processes: []  # run again in the test below
     page.page = lambda studies: text
     assert page.check(studies) == []
     assert any("-99999" in line for line in page.check(studies, changed))
@@ -210,8 +211,10 @@ def test_a_cell_is_reproduced_and_another_value_is_found():
     page = benchmark("results_page")
     data = page.committed()["smoke"]
     row = page.cheapest(data)
-    entries = page.again(row)
-    page.again = lambda row: entries
+    with page.trial_processes(1) as processes:
+        entries = page.again(row, processes)
+    page.again = lambda row, processes: entries
+    page.differences_of_a_cell = partial(page.differences_of_a_cell, processes=None)
     assert page.differences_of_a_cell(data) == []
     row.lines.loc[row.lines["iteration"] == 5, "value"] += 1.0
     data.description["rounding"] = page.rounding()
