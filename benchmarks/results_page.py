@@ -122,9 +122,9 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
     """What differs where the first trial of the cheapest row is run again; empty where nothing does.
 
     A study of another version is not run again: it would differ. Another processor or library rounds sums otherwise,
-    and learning makes much of it: there, what differs only after the first iterations is printed, and is no difference,
-    nor is the KL. With a smooth utility of discrete states it differs at once, because eigenvectors of equal eigenvalues
-    are turned otherwise there, and with them the posterior's draws.
+    and learning makes much of it: there, what differs only after the first iterations is printed, and is no difference;
+    nor is the KL. With a smooth utility of discrete states that differs at once, because eigenvectors of equal
+    eigenvalues are turned otherwise there, and with them the posterior's draws.
     """
     row = cheapest(data)
     if row is None or data.description.get("version") != version("bayespbrl"):
