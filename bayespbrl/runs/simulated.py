@@ -3,10 +3,8 @@
 import jax
 
 from bayespbrl import rollouts
-from bayespbrl.experts import SIMULATED, Expert, NoisyExpert, named_expert
+from bayespbrl.experts import Expert, NoisyExpert, named_expert
 from bayespbrl.learner import Learner
-
-__all__ = ["SIMULATED", "expert_of"]
 
 EPISODES = 100  # of the first policy, for the units of the task's return
 IN_UNITS_OF_THE_TASK = ("stochastic", "skipping", "equal", "margin")

@@ -111,8 +111,9 @@ DEFAULT: dict[str, Any] = {
     "fixed_point_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
     "projection_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
 }
-# Of an iteration's trajectories at first, and the most trajectories that it takes for them.
-LEAST_STEPS, MOST_TRAJECTORIES = 400, 100
+# Trajectories of an iteration where actions are continuous; steps that the first ones should have in all, and the most
+# trajectories that an iteration may take for them.
+TRAJECTORIES, LEAST_STEPS, MOST_TRAJECTORIES = 10, 400, 100
 # Where people answer.
 PEOPLE: dict[str, Any] = {
     "repeats": 0.1,  # a simulated expert would only repeat itself
@@ -152,7 +153,7 @@ class Task:
         return ({} if dimensions else {"restart_iterations": 0}) | {
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
-            "trajectories_per_iteration": 10 if continuous else 20,
+            "trajectories_per_iteration": TRAJECTORIES if continuous else 20,
             "check_episodes": (8 if people else 32) if continuous else (40 if people else 100),
             "centres": 300 if continuous else 100,
             "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
@@ -164,13 +165,11 @@ class Task:
         Decision: as many as have `LEAST_STEPS` steps, but at most `MOST_TRAJECTORIES`; from ten of four steps each
         nothing is learned about InvertedPendulum.
         """
-        if self.steps_at_first is None or not isinstance(self.action_space, Box):
+        enough = LEAST_STEPS // TRAJECTORIES  # steps of an episode: of longer ones the usual number suffices
+        if self.steps_at_first is None or not isinstance(self.action_space, Box) or self.horizon <= enough:
             return {}
-        usual: int = self.derived(people=False)["trajectories_per_iteration"]
-        enough = LEAST_STEPS // usual
-        steps = self.steps_at_first(enough) if enough < self.horizon else enough
-        wanted = math.ceil(LEAST_STEPS / steps)
-        return {"trajectories_per_iteration": min(max(usual, wanted), MOST_TRAJECTORIES)} if steps < enough else {}
+        wanted = math.ceil(LEAST_STEPS / self.steps_at_first(enough))
+        return {"trajectories_per_iteration": min(wanted, MOST_TRAJECTORIES)}
 
 
 def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None) -> dict[str, Any]:

@@ -10,9 +10,10 @@ import xarray as xr
 
 from bayespbrl import checks, runs
 from bayespbrl.envs.opening import environment_name, open_environment
+from bayespbrl.experts import SIMULATED
 from bayespbrl.learner import Learner, task_of
 from bayespbrl.runs.directory import RunDirectory, read_summary
-from bayespbrl.runs.simulated import SIMULATED, expert_of
+from bayespbrl.runs.simulated import expert_of
 from bayespbrl.settings import Settings, settings_for
 from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
