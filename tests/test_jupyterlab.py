@@ -37,6 +37,7 @@ def lab(tmp_path):
     options = ["--no-browser", "--allow-root", "--ServerApp.token=t", f"--port={port}", "--ServerApp.port_retries=0"]
     options += ["--expose-app-in-browser", "--LabApp.news_url=None", "--LabApp.check_for_updates_class="]
     options[-1] += "jupyterlab.handlers.announcements.NeverCheckForUpdate"
+    options += ["--KernelManager.transport=ipc"]  # a TCP port may be taken before the kernel binds it; the kernel then dies
     command = [sys.executable, "-m", "jupyterlab", *options]
     server = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
@@ -49,6 +50,16 @@ def lab(tmp_path):
     finally:
         server.kill()
         server.communicate()
+
+
+def close_dialogs(opened):
+    """Whenever a dialog of JupyterLab is in the way, such as one about the kernel's connection, take what it offers."""
+
+    def close(dialog):
+        print("JupyterLab's dialog:", dialog.inner_text())
+        dialog.locator(".jp-mod-accept").click()
+
+    opened.add_locator_handler(opened.locator("dialog.jp-Dialog"), close)
 
 
 def run_first_cell(opened):
@@ -95,6 +106,7 @@ def test_a_scripted_person_answers_a_whole_run_in_jupyterlab(browser, lab):
     plain = bayespbrl.Learner("gridworld", expert="other", **QUICK)
     opened = browser.new_page(viewport={"width": 1100, "height": 1000})
     opened.set_default_timeout(120_000)  # milliseconds; machines may be busy
+    close_dialogs(opened)
     opened.goto(address)
     opened.wait_for_selector("[data-status=idle], .jp-Notebook-ExecutionIndicator[data-status=idle]")
     run_first_cell(opened)

@@ -44,7 +44,7 @@ def kernel():
 
     with pytest.MonkeyPatch.context() as environment:
         environment.delenv("BAYESPBRL_FULL", raising=False)
-        manager = KernelManager(kernel_name="python3")
+        manager = KernelManager(kernel_name="python3", transport="ipc")  # no port that another may take first
         manager.start_kernel(cwd=NOTEBOOKS[0].parent)
     yield manager
     manager.shutdown_kernel(now=True)
