@@ -37,7 +37,7 @@ def lab(tmp_path):
     options = ["--no-browser", "--allow-root", "--ServerApp.token=t", f"--port={port}", "--ServerApp.port_retries=0"]
     options += ["--expose-app-in-browser", "--LabApp.news_url=None", "--LabApp.check_for_updates_class="]
     options[-1] += "jupyterlab.handlers.announcements.NeverCheckForUpdate"
-    options += ["--KernelManager.transport=ipc"]  # a TCP port may be taken before the kernel binds it; the kernel then dies
+    options += ["--KernelManager.transport=ipc"]  # no TCP port that another may take before the kernel
     command = [sys.executable, "-m", "jupyterlab", *options]
     server = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:

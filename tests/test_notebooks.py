@@ -38,13 +38,14 @@ def test_there_is_a_notebook():
 
 
 @pytest.fixture(scope="module")
-def kernel():
+def kernel(tmp_path_factory):
     """One kernel for all notebooks: importing the package and tracing its programs takes longer than most cells."""
     from jupyter_client.manager import KernelManager
 
     with pytest.MonkeyPatch.context() as environment:
         environment.delenv("BAYESPBRL_FULL", raising=False)
-        manager = KernelManager(kernel_name="python3", transport="ipc")  # no port that another may take first
+        sockets = str(tmp_path_factory.mktemp("kernel") / "ipc")  # no TCP port that another may take first
+        manager = KernelManager(kernel_name="python3", transport="ipc", ip=sockets)
         manager.start_kernel(cwd=NOTEBOOKS[0].parent)
     yield manager
     manager.shutdown_kernel(now=True)
