@@ -9,7 +9,8 @@ from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.settings import OPTIONS, Settings, settings_for
-from bayespbrl.settings.presets import DEFAULT, IDS, PAPER, TASKS, Task
+from bayespbrl.settings.presets import DEFAULT, IDS, PAPER, TASKS
+from bayespbrl.settings.tasks import Task
 
 NAN, INFINITY = float("nan"), float("inf")
 BAD = {

@@ -18,7 +18,8 @@ from bayespbrl.models import PreferenceModel
 from bayespbrl.policies.choice import POLICIES
 from bayespbrl.questions import Questions
 from bayespbrl.settings import presets
-from bayespbrl.settings.presets import Task, preset_options
+from bayespbrl.settings.presets import preset_options
+from bayespbrl.settings.tasks import Task
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 
 LAST_ITERATIONS = 5  # after the last answer: the policy catches up with what is known
