@@ -12,7 +12,7 @@ from bayespbrl import events, queries, rollouts
 from bayespbrl.cycle import Cycle
 from bayespbrl.envs import opening
 from bayespbrl.envs.opening import AnyEnvironment
-from bayespbrl.envs.stepping import random_steps
+from bayespbrl.envs.stepping import random_episodes
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
@@ -335,7 +335,7 @@ class Learner:
 def task_of(environment: gymnasium.Env, max_steps: int | None = None) -> Task:
     """The properties of a task that the default preset depends on; `ValueError` where no time limit is known."""
     horizon = rollouts.step_limit(environment, max_steps)
-    return Task(environment.observation_space, environment.action_space, horizon, partial(random_steps, environment))
+    return Task(environment.observation_space, environment.action_space, horizon, partial(random_episodes, environment))
 
 
 Choice = TypeVar("Choice")

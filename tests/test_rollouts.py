@@ -17,7 +17,7 @@ import bayespbrl
 from bayespbrl import rollouts
 from bayespbrl.envs import functional, opening
 from bayespbrl.envs.opening import open_environment
-from bayespbrl.envs.stepping import random_steps
+from bayespbrl.envs.stepping import random_episodes
 from bayespbrl.rollouts import returns, rollout
 
 KEY = jax.random.key(5)
@@ -425,11 +425,22 @@ def test_the_time_limit_is_the_environments_own(environment, limit):
     assert rollouts.step_limit(environment) == limit
 
 
-def test_the_first_steps_of_random_actions_are_counted_up_to_a_limit_the_same_at_every_call():
-    assert [random_steps(open_environment(Push(steps)), 6) for steps in (1, 4, 9)] == [1.0, 4.0, 6.0]
+def test_episodes_of_random_actions_are_cut_and_held_the_same_at_every_call():
+    for steps, cut in ((1, 1), (4, 4), (9, 6)):
+        assert {len(states) - 1 for states in random_episodes(open_environment(Push(steps)), 6)} == {cut}
     cart = open_environment("CartPole-v1")
-    assert random_steps(cart, 40) == random_steps(cart, 40) < 40
+    one, again = random_episodes(cart, 40), random_episodes(cart, 40)
+    assert all(np.array_equal(*pair) for pair in zip(one, again, strict=True))
+    assert np.mean([len(states) for states in one]) < 40
+    forces = [np.sign(np.diff(states[:, 1])) for states in random_episodes(cart, 40, hold=4)]
+    assert all((block == block[0]).all() for force in forces for block in np.split(force, range(4, len(force), 4)))
+    assert len({tuple(force[:8]) for force in forces}) > 1
     cart.reset(seed=0)  # still open
+
+
+@pytest.mark.parametrize(("task", "holds"), [("Acrobot-v1", {4}), ("MountainCar-v0", {16, 32}), ("CartPole-v1", {1})])
+def test_a_learner_repeats_random_actions_where_they_lead_nowhere_by_themselves(task, holds):
+    assert bayespbrl.Learner(task).settings.rollouts.exploration_hold in holds
 
 
 def test_a_learner_of_episodes_that_end_at_once_collects_more_of_them():

@@ -169,9 +169,40 @@ def test_the_default_derives_from_spaces_and_horizon_what_tasks_differ_in():
     ],
 )
 def test_where_episodes_end_at_once_an_iteration_takes_more_of_them(steps, task, options, number):
-    task = replace(TASK, steps_at_first=lambda most: min(steps, most), **task)
+    def random_episodes(most, hold):  # two, of this mean
+        return [np.zeros((1 + int(min(length, most)), 3)) for length in (steps - steps % 1, steps + steps % 1)]
+
+    task = replace(TASK, random_episodes=random_episodes, **task)
     assert settings_for("SomebodysEnv-v3", task=task, **options).rollouts.trajectories_per_iteration == number
     assert settings_for("swing-up", task=task).rollouts.trajectories_per_iteration == 10  # its own
+
+
+@pytest.mark.parametrize(
+    ("widest", "steps", "task", "options", "hold"),
+    [
+        (8, 200, {}, {}, 8),
+        (1, 200, {}, {}, 1),
+        (64, 200, {}, {}, 32),  # five actions an episode at least
+        (8, 20, {"horizon": 20}, {}, 4),
+        (8, 3, {"horizon": 3}, {}, 1),
+        (8, 170, {}, {}, 1),  # episodes end: to stay is what counts
+        (8, 200, {"action_space": Box(-1.0, 1.0, (1,))}, {}, None),
+        (8, 200, {"observation_space": Discrete(4)}, {}, 1),
+        (8, 200, {}, {"exploration_hold": 3}, 3),
+        (8, 200, {}, {"preset": "paper"}, 1),
+    ],
+)
+def test_where_random_actions_end_no_episode_those_are_repeated_that_spread_the_states_most(
+    widest, steps, task, options, hold
+):
+    def random_episodes(most, held):  # one dimension that is much wider than the other, and one that never varies
+        width = 1 / (1 + abs(np.log2(held / widest)))
+        line = np.linspace(0, 1, min(steps, most) + 1)
+        return [np.stack([1000 * width * line, width * line, 0 * line], axis=1)] * 2
+
+    task = replace(TASK, **{"action_space": Discrete(3), "random_episodes": random_episodes} | task)
+    assert settings_for("SomebodysEnv-v3", task=task, **options).rollouts.exploration_hold == hold
+    assert settings_for("gridworld", task=task).rollouts.exploration_hold == 3  # its own
 
 
 def test_iterations_follow_from_the_budget_of_answers():

@@ -57,20 +57,27 @@ def episodes_by_interface(
         vector.close()
 
 
-def random_steps(env: gymnasium.Env, most: int) -> float:
-    """Mean number of steps of a few episodes of random actions, each cut after `most`; the same at every call.
+def random_episodes(env: gymnasium.Env, most: int, hold: int = 1) -> list[Rows]:
+    """The states of a few episodes of random actions, the same at every call.
+
+    Args:
+      most: steps after which an episode is cut.
+      hold: steps for which an action is repeated.
 
     Raises:
       ValueError: as `episodes_by_interface`.
     """
     space = deepcopy(env.action_space)
     space.seed(0)
+    held: list[Rows] = []
 
     def act(first: int, step: int, observations: Rows) -> Rows:
-        return np.stack([np.asarray(space.sample()) for _ in observations])
+        if step % hold == 0:
+            held[:] = [np.stack([np.asarray(space.sample()) for _ in observations])]
+        return held[0]
 
     drawn = episodes_by_interface(env, act, seeds=0, episodes=PROBES, steps=most)
-    return float(np.mean([len(actions) for _, actions, _, _ in drawn]))
+    return [states for states, _, _, _ in drawn]
 
 
 class _Borrowed(gymnasium.Wrapper):

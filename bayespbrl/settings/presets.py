@@ -133,8 +133,11 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     people = chosen.get("expert", "return") not in SIMULATED
     known = TASKS.get(name, {})
     options = DEFAULT | ({} if task is None else task.derived(people=people)) | known
-    if task is not None and "trajectories_per_iteration" not in {*known, *chosen}:
-        options |= task.more_trajectories()
+    if task is not None:  # measured only where it matters
+        if "trajectories_per_iteration" not in {*known, *chosen}:
+            options |= task.more_trajectories()
+        if "exploration_hold" not in {*known, *chosen}:
+            options |= task.longer_hold()
     if people:
         options |= PEOPLE
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":

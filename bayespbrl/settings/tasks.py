@@ -5,12 +5,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box
+from jaxtyping import Float
 
 # Trajectories of an iteration where actions are continuous; steps that the first ones should have in all, and the most
 # trajectories that an iteration may take for them.
 TRAJECTORIES, LEAST_STEPS, MOST_TRAJECTORIES = 10, 400, 100
+# Random actions end no episode if these take at least such a share of the horizon; and how many of them an episode has
+# at least, however long they are repeated.
+NEARLY_ALL, LEAST_DRAWS = 0.9, 5
 
 
 @dataclass(frozen=True)
@@ -20,13 +25,14 @@ class Task:
     Attributes:
       observation_space, action_space: of the environment.
       horizon: its time limit, in steps.
-      steps_at_first: how many steps an episode of random actions takes, cut after the given number; None: not measured.
+      random_episodes: the states of a few episodes of random actions, by the steps after which an episode is cut and the
+        steps for which an action is repeated; None: not measured.
     """
 
     observation_space: Space[Any]
     action_space: Space[Any]
     horizon: int
-    steps_at_first: Callable[[int], float] | None = None
+    random_episodes: Callable[[int, int], list[Float[np.ndarray, "t d"]]] | None = None
 
     def derived(self, *, people: bool) -> dict[str, Any]:
         """Options by spaces and horizon, and by whether people answer (they wait).
@@ -56,7 +62,33 @@ class Task:
         nothing is learned about InvertedPendulum.
         """
         enough = LEAST_STEPS // TRAJECTORIES  # steps of an episode: of longer ones the usual number suffices
-        if self.steps_at_first is None or not isinstance(self.action_space, Box) or self.horizon <= enough:
+        if self.random_episodes is None or not isinstance(self.action_space, Box) or self.horizon <= enough:
             return {}
-        wanted = math.ceil(LEAST_STEPS / self.steps_at_first(enough))
+        wanted = math.ceil(LEAST_STEPS / _mean_steps(self.random_episodes(enough, 1)))
         return {"trajectories_per_iteration": min(wanted, MOST_TRAJECTORIES)}
+
+    def longer_hold(self) -> dict[str, Any]:
+        """Random discrete actions that are repeated, where single ones lead nowhere: none of them ends an episode.
+
+        Decision: for 1, 2, 4, … steps, whichever spreads the states most: the mean over dimensions of their standard
+        deviation, as a share of the largest. Acrobot-v1 and MountainCar-v0 reach their goals so, and never by
+        single actions; where episodes end early, as CartPole's, staying is what has to be learned.
+        """
+        observed = self.observation_space
+        if self.random_episodes is None or isinstance(self.action_space, Box) or not isinstance(observed, Box):
+            return {}
+        episodes = self.random_episodes(self.horizon, 1)
+        if _mean_steps(episodes) < NEARLY_ALL * self.horizon:
+            return {}
+        holds = [2**power for power in range(1, 16) if 2**power * LEAST_DRAWS <= self.horizon]
+        spreads = [_spread(episodes)] + [_spread(self.random_episodes(self.horizon, hold)) for hold in holds]
+        shares = np.array(spreads) / np.maximum(np.max(spreads, axis=0), np.finfo(float).tiny)
+        return {"exploration_hold": [1, *holds][int(np.argmax(shares.mean(axis=1)))]}
+
+
+def _mean_steps(episodes: list[Float[np.ndarray, "t d"]]) -> float:
+    return float(np.mean([len(states) - 1 for states in episodes]))
+
+
+def _spread(episodes: list[Float[np.ndarray, "t d"]]) -> Float[np.ndarray, " d"]:
+    return np.concatenate(episodes).std(axis=0)
