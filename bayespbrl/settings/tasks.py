@@ -25,7 +25,7 @@ class Task:
     Attributes:
       observation_space, action_space: of the environment.
       horizon: its time limit, in steps.
-      random_episodes: the states of a few episodes of random actions, by the steps after which an episode is cut and the
+      random_episodes: the states of a few episodes of random actions, by the steps after which one is cut and the
         steps for which an action is repeated; None: not measured.
     """
 
