@@ -182,8 +182,8 @@ def test_where_episodes_end_at_once_an_iteration_takes_more_of_them(steps, task,
     [
         (8, 200, {}, {}, 8),
         (1, 200, {}, {}, 1),
-        (64, 200, {}, {}, 32),  # five actions an episode at least
-        (8, 20, {"horizon": 20}, {}, 4),
+        (64, 200, {}, {}, 16),  # ten actions an episode at least
+        (8, 20, {"horizon": 20}, {}, 2),
         (8, 3, {"horizon": 3}, {}, 1),
         (8, 170, {}, {}, 1),  # episodes end: to stay is what counts
         (8, 200, {"action_space": Box(-1.0, 1.0, (1,))}, {}, None),

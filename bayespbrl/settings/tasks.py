@@ -15,7 +15,7 @@ from jaxtyping import Float
 TRAJECTORIES, LEAST_STEPS, MOST_TRAJECTORIES = 10, 400, 100
 # Random actions end no episode if these take at least such a share of the horizon; and how many of them an episode has
 # at least, however long they are repeated.
-NEARLY_ALL, LEAST_DRAWS = 0.9, 5
+NEARLY_ALL, LEAST_DRAWS = 0.9, 10
 
 
 @dataclass(frozen=True)
