@@ -9,15 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.experimental.functional import FuncEnv
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Sequence
 from gymnasium.utils.env_checker import check_env
 from matplotlib.figure import Figure
 from PIL import Image
 from toys import Odd
 
+import bayespbrl
 from bayespbrl import envs
 from bayespbrl.envs import functional
-from bayespbrl.envs.opening import open_environment
+from bayespbrl.envs.opening import open_environment, to_plain
 from bayespbrl.envs.pictures import draw_trajectory, film, frames
 
 IDS = list(envs.SHORT_NAMES.values())
@@ -204,9 +205,32 @@ def test_an_unsupported_action_space_is_named(space):
 
 def test_an_unsupported_observation_space_is_named():
     odd = Odd(Discrete(2))
-    odd.observation_space = MultiDiscrete([2, 3])
-    with pytest.raises(ValueError, match="observation space, got MultiDiscrete"):
+    odd.observation_space = Sequence(Discrete(2))
+    with pytest.raises(ValueError, match="expected an observation space of fixed size, got Sequence"):
         open_environment(odd)
+
+
+def test_observations_of_several_parts_are_flattened_as_gymnasium_does():
+    space = Dict(hand=MultiDiscrete([2, 3]), place=Box(-1, 1, (2, 2)), turn=Discrete(3, start=1))
+    odd = Odd(Discrete(2))
+    odd.observation_space = space
+    opened = open_environment(odd)
+    assert opened.observation_space == Box(np.array([0.0] * 5 + [-1.0] * 4 + [0.0] * 3), np.ones(12), dtype=np.float64)
+    observation = {"hand": np.array([1, 2]), "place": np.array([[0.1, 0.2], [0.3, 0.4]], np.float32), "turn": 2}
+    expected = np.float32([0, 1, 0, 0, 1, 0.1, 0.2, 0.3, 0.4, 0, 1, 0]).astype(float)
+    np.testing.assert_array_equal(to_plain(space, observation), expected)
+
+
+def test_a_task_whose_observations_have_parts_is_learned_and_acted_in(tmp_path):
+    options = {"iterations": 1, "evaluation_episodes": 5, "max_steps": 20, "centres": 10}
+    bayespbrl.start("Blackjack-v1", tmp_path / "run", **options).run(bayespbrl.ReturnExpert())
+    observation, _ = gymnasium.make("Blackjack-v1").reset(seed=0)
+    policy = bayespbrl.load(tmp_path / "run").policy
+    assert policy.act(observation) in (0, 1)
+    assert policy.predict(observation, deterministic=True)[0] in (0, 1)
+    for wrong in (3, {"hand": 3}, (40, 1)):
+        with pytest.raises(ValueError, match=r"observation: expected one of Tuple\(Discrete\(32\), .*, got "):
+            policy.act(wrong)
 
 
 @pytest.mark.parametrize("name", ["swingup", "no/Such-v0", "CartPole-v99", "no_such_module:Env-v0", "not an id!", ""])

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.experimental.functional import FuncEnv
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, Space, flatten, flatten_space
 from gymnasium.wrappers import TransformAction, TransformObservation
 
 from bayespbrl.envs import SHORT_NAMES
@@ -37,10 +37,12 @@ def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
 
     The result has 1-D `Box` spaces or `Discrete` spaces counted from 0, so that policies and features meet nothing
     else. Decision: other shapes are flattened and other starts shifted, by wrappers that undo it on the way in.
-    Opening what is already open gives the same object back.
+    Observations of several parts (`Dict`, `Tuple`, `MultiDiscrete`, …) become numbers, discrete parts one-hot, as
+    gymnasium flattens them. Opening what is already open gives the same object back.
 
     Raises:
-      ValueError: unknown name; an environment that cannot be made; a space that is neither `Box` nor `Discrete`.
+      ValueError: unknown name; an environment that cannot be made; an action space that is neither a real `Box` nor
+        `Discrete`, or an observation space that gymnasium does not flatten.
     """
     if isinstance(environment, str | EnvSpec):
         spec = _spec(environment)
@@ -133,14 +135,14 @@ def _one_line(error: Exception) -> str:
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
     """`env` with 1-D `Box` spaces and `Discrete` spaces counted from 0; `env` itself where it has them already."""
     given, observations, actions = env, env.observation_space, env.action_space
-    for kind, space in (("observation", observations), ("action", actions)):
-        if not isinstance(space, Box | Discrete) or (
-            kind == "action" and isinstance(space, Box) and not np.issubdtype(space.dtype, np.floating)
-        ):
-            raise ValueError(
-                f"environment {environment_name(env)}: expected a Discrete or {'real ' if kind == 'action' else ''}Box "
-                f"{kind} space, got {space}"
-            )
+    if not observations.is_np_flattenable:
+        raise ValueError(
+            f"environment {environment_name(env)}: expected an observation space of fixed size, got {observations}"
+        )
+    if not (isinstance(actions, Discrete) or (isinstance(actions, Box) and np.issubdtype(actions.dtype, np.floating))):
+        raise ValueError(
+            f"environment {environment_name(env)}: expected a Discrete or real Box action space, got {actions}"
+        )
     if (plain := _plain_space(observations)) is not observations:
         env = TransformObservation(env, lambda value: to_plain(observations, value), plain)
     if (plain := _plain_space(actions)) is not actions:
@@ -155,12 +157,15 @@ def as_given(env: gymnasium.Env) -> gymnasium.Env:
     return _GIVEN.get(env, env)
 
 
-def _plain_space(space: Any) -> Any:
+def _plain_space(space: Space[Any]) -> Box | Discrete:
+    if isinstance(space, Discrete):
+        return space if space.start == 0 else Discrete(int(space.n))
     if isinstance(space, Box):
         if len(space.shape) == 1:
             return space
         return Box(space.low.reshape(-1), space.high.reshape(-1), dtype=space.dtype.type)
-    return space if space.start == 0 else Discrete(int(space.n))
+    parts: Any = flatten_space(space)
+    return Box(parts.low.astype(np.float64), parts.high.astype(np.float64), dtype=np.float64)
 
 
 def check_of_space(name: str, values: np.ndarray, space: gymnasium.Space[Any]) -> None:
@@ -174,10 +179,17 @@ def check_of_space(name: str, values: np.ndarray, space: gymnasium.Space[Any]) -
 
 
 def to_plain(space: Any, value: Any) -> Any:
-    """An observation or action of `space`, flattened."""
-    return np.reshape(value, -1) if isinstance(space, Box) else np.int64(value - space.start)
+    """An observation of `space`, flattened; `ValueError` for one whose parts are not those of the space."""
+    if isinstance(space, Discrete):
+        return np.int64(value - space.start)
+    if isinstance(space, Box):
+        return np.reshape(value, -1)
+    try:
+        return np.asarray(flatten(space, value), np.float64)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"observation: expected one of {space}, got {value!r}") from error
 
 
 def from_plain(space: Any, value: Any) -> Any:
-    """The inverse of `to_plain`."""
+    """An action of `space`, from a flattened one."""
     return np.reshape(value, space.shape) if isinstance(space, Box) else np.int64(value + space.start)

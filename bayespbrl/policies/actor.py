@@ -25,7 +25,7 @@ class Actor:
       rng: where a call without a key draws from.
       observe: from an observation of the environment to one of the policy's.
       enact: from an action of the policy's to one of the environment.
-      observation_shape: of one observation of the environment.
+      observation_shape: of one observation of the environment; None where it has parts, as those of a `Dict` space.
     """
 
     policy: Sampler
@@ -33,7 +33,7 @@ class Actor:
     rng: np.random.Generator
     observe: Callable[[Any], Any] = np.asarray
     enact: Callable[[Any], Any] = np.asarray
-    observation_shape: tuple[int, ...] = ()
+    observation_shape: tuple[int, ...] | None = ()
 
     def act(self, observation: Any, *, key: Key[Array, ""] | None = None) -> Any:
         """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete.
@@ -41,8 +41,9 @@ class Actor:
         Raises:
           ValueError: an observation of another shape.
         """
-        if (shape := np.asarray(observation).shape) != self.observation_shape:
-            raise ValueError(f"observation: expected shape {self.observation_shape}, got {shape}")
+        expected = self.observation_shape
+        if expected is not None and (shape := np.asarray(observation).shape) != expected:
+            raise ValueError(f"observation: expected shape {expected}, got {shape}")
         return self._drawn(self.policy, observation, key)
 
     __call__ = act
@@ -53,18 +54,18 @@ class Actor:
         """Action and `state`, for one observation or a batch of them, as stable-baselines3's policies give.
 
         Args:
-          observation: of the environment, or a batch with a leading axis.
+          observation: of the environment, or a batch with a leading axis; only one where observations have parts.
           state, episode_start: of recurrent policies; passed through and not looked at.
           deterministic: the mean of continuous actions, or the most probable discrete one, instead of a sample.
 
         Raises:
           ValueError: observations of another shape; a policy of the user's that has neither `mode` nor `probabilities`.
         """
-        observations = np.asarray(observation)
-        if observations.shape == self.observation_shape:
+        shape = self.observation_shape
+        if shape is None or np.asarray(observation).shape == shape:
             return self._chosen(observation, deterministic), state
-        if observations.shape[1:] != self.observation_shape:
-            shape = self.observation_shape
+        observations = np.asarray(observation)
+        if observations.shape[1:] != shape:
             raise ValueError(f"observation: expected shape {shape}, or a batch of them, got {observations.shape}")
         return np.stack([np.asarray(self._chosen(each, deterministic)) for each in observations]), state
 

@@ -171,7 +171,7 @@ class Run:
             np.random.default_rng(),
             observe=partial(to_plain, given.observation_space),
             enact=partial(from_plain, given.action_space),
-            observation_shape=given.observation_space.shape or (),
+            observation_shape=given.observation_space.shape,
         )
 
     @property
