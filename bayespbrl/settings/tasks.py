@@ -71,7 +71,7 @@ class Task:
         """Random discrete actions that are repeated, where single ones lead nowhere: none of them ends an episode.
 
         Decision: for 1, 2, 4, … steps, whichever spreads the states most: the mean over dimensions of their standard
-        deviation, as a share of the largest. Acrobot-v1 and MountainCar-v0 reach their goals so, and never by
+        deviation, as a share of the largest. Acrobot-v1 and MountainCar-v0 reach their goals so, and hardly ever by
         single actions; where episodes end early, as CartPole's, staying is what has to be learned.
         """
         observed = self.observation_space
