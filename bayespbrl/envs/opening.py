@@ -128,8 +128,8 @@ def _make(spec: EnvSpec) -> gymnasium.Env:
         ) from error
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def _one_line(value: object) -> str:
+    return " ".join(str(value).split())
 
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
@@ -187,7 +187,7 @@ def to_plain(space: Any, value: Any) -> Any:
     try:
         return np.asarray(flatten(space, value), np.float64)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"observation: expected one of {space}, got {value!r}") from error
+        raise ValueError(f"observation: expected one of {space}, got {_one_line(value)}") from error
 
 
 def from_plain(space: Any, value: Any) -> Any:

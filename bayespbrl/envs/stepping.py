@@ -69,12 +69,13 @@ def random_episodes(env: gymnasium.Env, most: int, hold: int = 1) -> list[Rows]:
     """
     space = deepcopy(env.action_space)
     space.seed(0)
-    held: list[Rows] = []
+    held = np.empty(0)
 
     def act(first: int, step: int, observations: Rows) -> Rows:
+        nonlocal held
         if step % hold == 0:
-            held[:] = [np.stack([np.asarray(space.sample()) for _ in observations])]
-        return held[0]
+            held = np.stack([np.asarray(space.sample()) for _ in observations])
+        return held
 
     drawn = episodes_by_interface(env, act, seeds=0, episodes=PROBES, steps=most)
     return [states for states, _, _, _ in drawn]

@@ -62,9 +62,8 @@ class Actor:
           ValueError: observations of another shape; a policy of the user's that has neither `mode` nor `probabilities`.
         """
         shape = self.observation_shape
-        if shape is None or np.asarray(observation).shape == shape:
+        if shape is None or (observations := np.asarray(observation)).shape == shape:
             return self._chosen(observation, deterministic), state
-        observations = np.asarray(observation)
         if observations.shape[1:] != shape:
             raise ValueError(f"observation: expected shape {shape}, or a batch of them, got {observations.shape}")
         return np.stack([np.asarray(self._chosen(each, deterministic)) for each in observations]), state

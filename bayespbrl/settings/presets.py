@@ -134,9 +134,10 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     known = TASKS.get(name, {})
     options = DEFAULT | ({} if task is None else task.derived(people=people)) | known
     if task is not None:  # measured only where it matters
-        if "trajectories_per_iteration" not in {*known, *chosen}:
+        given = {*known, *chosen}
+        if "trajectories_per_iteration" not in given:
             options |= task.more_trajectories()
-        if "exploration_hold" not in {*known, *chosen}:
+        if "exploration_hold" not in given:
             options |= task.longer_hold()
     if people:
         options |= PEOPLE
