@@ -46,7 +46,9 @@ def log_probability(t, *, m, lapse, number, threshold=None, tied=False):
 
 def quadrature(settings, *, tied=None, lapses=priors.LAPSE_RATE, sides=None, answerers=None):
     """Moments under the posterior of a scalar weight and all else, by enumeration, and the log evidence."""
-    w = np.linspace(-7, 7, 1401) + 1e-4
+    grid, spacing = np.linspace(-6.5, 6.5, 2601, retstep=True)
+    w = 0.02 * np.sinh(grid) + 1e-4  # to ±7, and dense where small thresholds are
+    log_width = np.log(0.02 * np.cosh(grid) * spacing)
     biases = np.linspace(-4, 4, 41) if sides is not None else np.zeros(1)
     number = settings.shape[1]
     tied = np.zeros(number, bool) if tied is None else tied
@@ -69,14 +71,14 @@ def quadrature(settings, *, tied=None, lapses=priors.LAPSE_RATE, sides=None, ans
                 for lapse in lapses.values
             ]
         )  # (lapse, answer, weight)
-        prior = np.log(p_m * p_d / len(settings)) - 0.5 * w**2 - 0.5 * b**2
+        prior = np.log(p_m * p_d / len(settings)) - 0.5 * w**2 + log_width - 0.5 * b**2
         for chosen in itertools.product(range(len(lapses.values)), repeat=answerers.max(initial=0) + 1):
             log_p = each[np.array(chosen)[answerers], np.arange(number)].sum(axis=0)
             log_weights.append(prior + log_p + np.log(lapses.probabilities[list(chosen)]).sum())
             first = lapses.values[chosen[0]]
             values.append((c, np.log(m), first, lapses.values[chosen[-1]], d, b * priors.SIDE_BIAS_SCALE))
     log_weights = np.array(log_weights)
-    evidence = logsumexp(log_weights) + np.log(w[1] - w[0]) - 0.5 * np.log(2 * np.pi)
+    evidence = logsumexp(log_weights) - 0.5 * np.log(2 * np.pi)
     if sides is not None:
         evidence += np.log(biases[1] - biases[0]) - 0.5 * np.log(2 * np.pi)
     p = np.exp(log_weights - logsumexp(log_weights))

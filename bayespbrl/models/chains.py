@@ -267,13 +267,13 @@ def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem)
         last: tuple[EllipticalSliceState, Unknowns], _: None
     ) -> tuple[tuple[EllipticalSliceState, Unknowns], tuple[Array, Array]]:
         state, unknowns = last
-        key, sub = random.split(state.rng_key)
-        z, unknowns = moved(sub, state.z["utility_weights"], unknowns, problem)
+        key, key_unknowns, key_weights = random.split(state.rng_key, 3)
+        z, unknowns = moved(key_unknowns, state.z["utility_weights"], unknowns, problem)
         if independent:
             ellipse = reference_ellipse(conditional(problem, unknowns))
-            z = independent_move(random.fold_in(sub, 1), z, ellipse, candidates=INDEPENDENT)
+            z = independent_move(key_weights, z, ellipse, candidates=INDEPENDENT)
         if capacity > FEW and not has_steps(problem.settings.likelihood):
-            z = split_move(random.fold_in(sub, 1), z, conditional(problem, unknowns))
+            z = split_move(key_weights, z, conditional(problem, unknowns))
         state = state._replace(z={"utility_weights": z}, rng_key=key)
         state = kernel.sample(state, (conditional(problem, unknowns),), {})
         return (state, unknowns), (state.candidates, state.stuck)

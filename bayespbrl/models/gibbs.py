@@ -126,17 +126,18 @@ def moved(
     key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem
 ) -> tuple[Float[Array, " q"], Unknowns]:
     """New weights and unknowns after one move of each kind; fixed parameters have no move."""
-    keys = random.split(key, 4)
+    # never `fold_in` beside `split`: its keys are the same, and moves that share a key share their random numbers
+    key_setting, *keys, key_steepness, key_threshold = random.split(key, 6)
     if len(problem.log_probabilities) > 1:
-        z, unknowns = _setting_move(keys[0], z, unknowns, problem)
+        z, unknowns = _setting_move(key_setting, z, unknowns, problem)
     if problem.fitted_steepness is not None:
-        z, unknowns = _steepness_move(random.fold_in(key, 0), z, unknowns, problem)
+        z, unknowns = _steepness_move(key_steepness, z, unknowns, problem)
     if len(problem.tie_threshold.values) > 1:
-        z, unknowns = _threshold_move(random.fold_in(key, 1), z, unknowns, problem)
+        z, unknowns = _threshold_move(key_threshold, z, unknowns, problem)
     loadings = problem.settings.loadings
     few = loadings.shape[1] <= FEW
     margins = (loadings[unknowns.setting] if few else at_setting(loadings, unknowns.setting)) @ z
-    for key, name in zip(keys[1:], ("steepness", "lapse_rate", "tie_threshold"), strict=True):
+    for key, name in zip(keys, ("steepness", "lapse_rate", "tie_threshold"), strict=True):
         prior: Table = getattr(problem, name)
         if len(prior.values) > 1:
             every = point_of(problem, unknowns)._replace(**{name: prior.values[:, None]})

@@ -42,7 +42,8 @@ STEEPNESS = _even(_medians(stats.lognorm(s=1.0, scale=5.0), 9))
 # λ: half of all answerers are attentive; of the others it is Beta(1, 3), mean a quarter, and above a half in 13 %.
 _LAPSES = _medians(stats.beta(1, 3), 12)
 LAPSE_RATE = Grid(np.concatenate([[0.0], _LAPSES]), np.concatenate([[0.5], np.full(12, 0.5 / 12)]))
-# δ: a third of a standard deviation of the margins, give or take a factor of e.
-TIE_THRESHOLD = _even(_medians(stats.lognorm(s=1.0, scale=1 / 3), 12))
+# δ: a tenth of a standard deviation of the margins, give or take a factor of e². Some people call what differs by a
+# third of it equal, others only what is exactly equal: an expert who computes returns.
+TIE_THRESHOLD = _even(_medians(stats.lognorm(s=2.0, scale=0.1), 12))
 # Standard deviation of the margin by which an answerer favours the one shown first.
 SIDE_BIAS_SCALE = 0.3
