@@ -161,3 +161,8 @@ def test_a_preference_model_names_its_likelihood():
     assert (ties_of(inferred).ordered.steepness, inferred.lapse_rate) == (STEEPNESS.mean, LAPSE_RATE.mean)
     with pytest.raises(ValueError, match=r"indifferent: expected bool of shape \(K,\)"):
         lapsing.answer_likelihood(2, np.zeros(2))
+
+
+def test_many_ties_at_a_tiny_threshold_do_not_overflow():
+    tied = with_threshold(Mixed(5.0, 32), 1e-12, np.ones(32, dtype=bool))
+    assert float(total_log_prob(tied, np.zeros(32))) == pytest.approx(float(log_prob(tied, np.zeros(32)).sum()))

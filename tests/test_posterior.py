@@ -182,6 +182,24 @@ def test_a_tree_on_disk_comes_back_whole(tree, tmp_path):
     assert {k: v for k, v in back.attrs.items() if v == v} == {k: v for k, v in tree.attrs.items() if v == v}
 
 
+def test_draws_in_the_coordinates_of_another_processor_keep_their_margins():
+    """Where a question was repeated, rounding turns the later coordinates: differently on each processor."""
+    differences = consistent(6, 9)
+    differences = np.stack([differences, differences[:, ::-1]])
+    differences[:, 1] = differences[:, 0]
+    here = sample_posterior(differences, num_samples=50, max_samples=50)
+    there, turn = stored(here), np.linalg.qr(np.random.default_rng(0).normal(size=(5, 5)))[0]
+    there["posterior"]["coordinates"] = (
+        there["posterior"]["coordinates"]
+        .dot(xr.DataArray(turn, dims=("coordinate", "turned")))
+        .rename(turned="coordinate")
+    )
+    back = restored(there)
+    for name in ("posterior/utility_weights", "utility_weights_mean"):
+        np.testing.assert_allclose(back[name].values, here[name].values, atol=1e-12)
+    assert np.array_equal(restored(stored(here))["posterior/coordinates"], here["posterior/coordinates"])
+
+
 def test_the_same_seed_gives_the_same_draws(tree):
     again = sample_posterior(consistent(6, 9), seed=3)
     np.testing.assert_array_equal(again["posterior/margins"], tree["posterior/margins"])

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from scipy.stats import norm
 
 from bayespbrl.diagnostics import plot_sensitivity, sensitivity
+from bayespbrl.diagnostics.power_scaling import _quantities
 from bayespbrl.models import sample_posterior
 
 SAMPLING = {"num_warmup": 100, "num_samples": 400, "max_samples": 400}
@@ -41,6 +42,15 @@ def test_utility_that_no_answer_constrains_depends_on_the_prior_scale_alone(tree
     assert list(result["diagnosis"].values) == ["prior", "prior"]
     # the unit of a utility does not matter
     np.testing.assert_allclose(*of_component(result, "prior"), rtol=1e-9)
+
+
+def test_features_have_no_side():
+    """The same pair, shown on both sides: half the sum of both margins is the utility of its difference."""
+    tree = sample_posterior(DIFFERENCES[[0, 0, 1]], shown_first=[1, -1, 1], likelihood="logistic", **SAMPLING)
+    draws, _ = _quantities(tree, DIFFERENCES[:1], seed=0)
+    margins = tree["posterior/margins"].values
+    np.testing.assert_allclose(draws[..., 0], margins[..., :2].mean(axis=2), atol=1e-12)
+    assert sensitivity(tree, DIFFERENCES[:1]).sizes["quantity"] == 1
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.models.low_rank import low_rank
+from bayespbrl.models.posterior_tree import bases_of
 
 COMPONENTS = ("prior", "likelihood")
 # Least standard deviation of a log density over the draws, in nats. Below it powers near 1 have no visible effect, and
@@ -84,7 +85,8 @@ def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) ->
             f"features: expected None for a posterior over {len(known)} settings, got shape {np.shape(features)}"
         )
     features = checks.matrix("features", features, columns=known.shape[1])
-    basis = low_rank(known).basis
+    (basis,) = bases_of(tree)
+    features = np.pad(features, [(0, 0), (0, len(basis) - known.shape[1])])  # no side is in them
     inside = features @ basis
     # of the directions without any answer only those of the features: all D would dominate the importance weights
     rest = features - inside @ basis.T

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import ndtr
 
 LIKELIHOODS = ("mixed", "logistic", "probit")  # names of those that have neither lapses nor ties
+LEAST_SCALED = 1e-8  # threshold of ties by which their probability is scaled: a product of 32 factors must stay finite
 Values = Float[Array, "..."]  # one for each margin, and for each value of a parameter
 # a number, or what JAX makes of it where it traces a function, or an array that broadcasts against the margins
 Scalar = float | Float[Array, "..."] | Float[np.ndarray, "..."]
@@ -232,7 +233,7 @@ class WithTies:
             jnp.where(self.indifferent, below + self.threshold, margins - self.threshold)
         )
         lower, of_lower = self.ordered.factor(below - self.threshold)
-        scale = 1 + 1 / jnp.asarray(self.threshold)
+        scale = 1 + 1 / jnp.maximum(self.threshold, LEAST_SCALED)
         # Rao & Kupper (1967): p(tie) = p(t + δ) − p(t − δ)
         left = jnp.maximum(ratio - jnp.exp(lower - exponent) * of_lower, 0) * scale
         return jnp.where(self.indifferent, exponent - jnp.log(scale), exponent), jnp.where(

@@ -10,15 +10,17 @@ from numpy.typing import ArrayLike
 from xarray.core import indexing
 
 from bayespbrl import checks
+from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import Convergence
 from bayespbrl.models.gaussian_fit import GaussianFit
 from bayespbrl.models.likelihoods import ties_of
-from bayespbrl.models.low_rank import UtilityWeights, low_rank
+from bayespbrl.models.low_rank import LowRank, UtilityWeights, low_rank, used_rows
 from bayespbrl.models.preference_model import Answers
 from bayespbrl.models.priors import SIDE_BIAS_SCALE
 
 SAMPLE = ("chain", "draw")
+SAME_MARGINS = 1e-6  # relative to the largest: rounding on one machine, in another's coordinates the error is near 1
 
 
 def settings_of(differences: ArrayLike) -> Float[np.ndarray, "s k d"]:
@@ -138,9 +140,15 @@ def next_lapse_rates(tree: xr.DataTree) -> Float[np.ndarray, "chain draw"]:
 
 def bases_of(tree: xr.DataTree) -> list[Float[np.ndarray, "d r"]]:
     """Q of each setting, of the features and, where they are known, the sides."""
+    return [factors.basis for factors in _factors_of(tree)]
+
+
+def _factors_of(tree: xr.DataTree) -> list[LowRank]:
+    """As when the tree was sampled, if by this machine."""
     settings = settings_of(tree.children["constant_data"].dataset["differences"].values)
     augmented = answers_of(tree).with_sides(settings, float(tree.attrs["prior_scale"]))
-    return [low_rank(each).basis for each in augmented]
+    with one_blas_thread():
+        return [low_rank(each) for each in augmented]
 
 
 def stored(tree: xr.DataTree) -> xr.DataTree:
@@ -153,7 +161,27 @@ def stored(tree: xr.DataTree) -> xr.DataTree:
 
 def restored(tree: xr.DataTree) -> xr.DataTree:
     """The tree with `posterior["utility_weights"]`, computed where it is indexed, the side bias, and points for all."""
-    return _with_weights(tree, bases_of(tree))
+    factors = _factors_of(tree)
+    return _with_weights(_in_these_coordinates(tree, factors), [each.basis for each in factors])
+
+
+def _in_these_coordinates(tree: xr.DataTree, factors: Sequence[LowRank]) -> xr.DataTree:
+    """The tree with coordinates z that have its margins under these factors, t = L z.
+
+    Where rows of the differences depend on those before them (repeated questions, ties), Q is determined by rounding,
+    which differs between processors. The margins determine w = Q z all the same.
+    """
+    posterior = tree.children["posterior"].to_dataset(inherit=False)
+    z, margins, settings = (posterior[name].values for name in ("coordinates", "margins", "setting"))
+    new = z.copy()
+    for number, each in enumerate(factors):
+        chosen, rank, used = settings == number, each.basis.shape[1], used_rows(each.loadings)
+        wanted, found = margins[chosen][:, used], z[chosen][:, :rank] @ each.loadings[used].T
+        if not np.allclose(found, wanted, rtol=0, atol=SAME_MARGINS * np.max(np.abs(wanted), initial=0.0)):
+            lengths = np.linalg.norm(each.loadings[used], axis=1)
+            moved = np.linalg.lstsq(each.loadings[used] / lengths[:, None], (wanted / lengths).T, rcond=None)[0].T
+            new[chosen, :rank] = moved
+    return _replaced(tree, posterior.assign(coordinates=(posterior["coordinates"].dims, new)), tree.to_dataset())
 
 
 def _with_weights(tree: xr.DataTree, bases: Sequence[Float[np.ndarray, "d _"]]) -> xr.DataTree:
