@@ -24,7 +24,7 @@ from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.policies import Sampler, greedy
-from bayespbrl.preferences import opponents_from_the_same_start, rivals
+from bayespbrl.preferences import opponent_now, opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory, clips_of, transitions
@@ -186,14 +186,14 @@ class Cycle:
         if again is not None:
             shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
             return _entry({"event": "asked", "query": number, **shown, "repeats": again.number, **who})
-        incumbent = state.opponents[newcomer] if state.opponents else state.preferences.undominated[-1]
+        preferences = state.preferences
+        incumbent = opponent_now(newcomer, state.opponents, state.trajectories, preferences)
         query = queries.show(number, newcomer, incumbent, state.compared, rng=self._rng(SHOW, number))
         shown = {"first": query.first, "second": query.second, "newcomer": newcomer}
         event = {"event": "asked", "query": number, **shown, **who}
         if options.same_start:
-            beside = rivals(query, state.trajectories, state.preferences)
-            tied = beside if answerer is None else state.preferences.tied_with(incumbent)
-            event["rivals"] = [number for number in beside if number in tied]
+            tied = preferences.undominated if answerer is None else preferences.tied_with(incumbent)
+            event["rivals"] = [each for each in rivals(query, state.trajectories, preferences) if each in tied]
         return _entry(event)
 
     def improve(self, state: LearnerState) -> Entry:

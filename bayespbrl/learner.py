@@ -2,17 +2,15 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium
 import numpy as np
 
-from bayespbrl import events, queries, rollouts
+from bayespbrl import events, queries
 from bayespbrl.cycle import Cycle
 from bayespbrl.envs import opening
 from bayespbrl.envs.opening import AnyEnvironment
-from bayespbrl.envs.stepping import random_episodes
 from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
@@ -45,7 +43,7 @@ class Learner:
       entries: events of a run to continue.
       kept: the settings of that run, which hold then as they are.
       **options: any option of `Settings` or its parts by its own name, such as `answers=12`; the preset gives the
-        others. `learner.settings.options()` has all of them with their values.
+        others, and None is a value like any other. `learner.settings.options()` has all of them with their values.
 
     Raises:
       ValueError: an unknown environment or option, a value out of range, or no time limit known.
@@ -77,14 +75,17 @@ class Learner:
                 f"environment: expected the environment as env only, got environment={options['environment']!r} too"
             )
         own_policy = None if policy is None or isinstance(policy, str) else policy
+        own = {
+            "policy": policy if own_policy is None else "other",
+            "features": None if features is None else "other",
+            "environment": None if opening.given_by_name(env) else "other",
+            "schedule": "other" if callable(schedule) else schedule,
+            "query": "other" if callable(query) else query,
+        }
         self.settings: Settings = kept or settings_for(
             env if isinstance(env, str) else opening.environment_name(self.environment),
-            policy=policy if own_policy is None else "other",
-            features=None if features is None else "other",
-            environment=None if opening.given_by_name(env) else "other",
-            schedule="other" if callable(schedule) else schedule,
-            query="other" if callable(query) else query,
-            task=task_of(self.environment, options.get("max_steps")),
+            task=Task.of(self.environment, options.get("max_steps")),
+            **{name: value for name, value in own.items() if value is not None},
             **options,
         )
         self.features = features
@@ -330,12 +331,6 @@ class Learner:
         if self.log is not None:
             self.log.append(entry, state)
         self.state = state
-
-
-def task_of(environment: gymnasium.Env, max_steps: int | None = None) -> Task:
-    """The properties of a task that the default preset depends on; `ValueError` where no time limit is known."""
-    horizon = rollouts.step_limit(environment, max_steps)
-    return Task(environment.observation_space, environment.action_space, horizon, partial(random_episodes, environment))
 
 
 Choice = TypeVar("Choice")

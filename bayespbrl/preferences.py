@@ -1,6 +1,6 @@
 """Preferences ζ: questions, answers, the ordered pairs and the undominated trajectories (paper, step 4)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -171,8 +171,8 @@ class Preferences:
         A better newcomer is preferred over every rival and replaces them. Over a worse one, every rival is preferred.
         In a tie (`preferred=None`) the newcomer joins them, and the pair is a tie.
 
-        Where several people answer at once, an incumbent may have become dominated since it was asked about. Then the
-        answer is about the two alone, and only a better newcomer becomes undominated.
+        Where several people answer at once, or several questions of an iteration have one opponent, an incumbent may
+        have become dominated. Then the answer is about the two alone, and only a better newcomer becomes undominated.
 
         Args:
           rivals: the undominated trajectories that the newcomer is compared with, the incumbent among them unless it
@@ -189,8 +189,11 @@ class Preferences:
         if preferred not in (None, newcomer, incumbent):
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
         beside = self.undominated if rivals is None else tuple(each for each in rivals if each in self.undominated)
-        fallen = incumbent not in beside and rivals is not None and incumbent in rivals
-        if incumbent not in beside:
+        beaten = incumbent not in self.undominated and any(incumbent == worse for _, worse in self.pairs)
+        fallen = rivals is not None and (beaten or (incumbent not in beside and incumbent in rivals))
+        if fallen:
+            beside = (incumbent,)
+        elif incumbent not in beside:
             beside = (*beside, incumbent)
         others = tuple(each for each in self.undominated if each not in beside)
         asked = (incumbent, newcomer) if preferred == incumbent else (newcomer, incumbent)
@@ -320,6 +323,21 @@ def opponents_from_the_same_start(
             if rivals:
                 chosen[number] = rivals[0]
     return chosen
+
+
+def opponent_now(
+    newcomer: int, opponents: Mapping[int, int], trajectories: Sequence[Trajectory], preferences: Preferences
+) -> int:
+    """The newcomer's opponent, the newest undominated trajectory where there are no `opponents`.
+
+    One that another question of the iteration has beaten gives way to who is undominated from its start by then.
+    """
+    standing = preferences.undominated
+    opponent = opponents[newcomer] if opponents else standing[-1]
+    if opponent in standing or all(opponent != worse for _, worse in preferences.pairs):
+        return opponent
+    group = next(group for group in same_starts(trajectories) if opponent in group)
+    return next((each for each in reversed(standing) if each in group and each != newcomer), opponent)
 
 
 def rivals(query: Query, trajectories: Sequence[Trajectory], preferences: Preferences) -> list[int]:

@@ -71,7 +71,8 @@ def rollout(
       max_steps: time limit; by default the environment's own.
       hold: steps for which the policy's random key stays the same, ≥ 1. Each action still follows the policy at its
         state. Noise that neighbouring steps share leads further away than noise that averages out.
-      starts: a seed for the reset of each episode; None: `key` decides on them.
+      starts: a seed for the reset of each episode; None: `key` decides on them. An environment that is stepped by the
+        gymnasium interface draws its own noise by that seed too.
 
     Raises:
       ValueError: bad arguments; no time limit known; an environment that raises, or returns NaN or an observation that

@@ -132,7 +132,8 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
     seed, entries = row.seeds[0], again(row, processes)
     kept = row.lines[row.lines["seed"] == seed]
     where = f"study {data.name}, {row.declared.name}, seed {seed}"
-    same = data.description.get("rounding") == rounding()  # studies that began before it was kept have none
+    parts = [data.description, *data.description.get("earlier", [])]
+    same = all(part.get("rounding") == rounding() for part in parts)  # studies that began before it was kept have none
     found = [
         (entry["iteration"], f"{where}, iteration {entry['iteration']}: expected {name} {expected}, got {entry[name]}")
         for entry, (_, line) in zip(entries, kept.iterrows(), strict=False)

@@ -394,7 +394,8 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
     good = json.dumps({"turn": turn, "answer": "first", "seconds": 1.0})
     before = gridworld.session.learner.log.log_file.read_bytes()
     foreign = {"Origin": "http://example.org"}
-    assert call(gridworld, "GET", f"{token}/")[0] == 200
+    for host in ("127.0.0.1", "LOCALHOST"):  # a name in any case
+        assert call(gridworld, "GET", f"{token}/", Host=f"{host}:{gridworld.port}")[0] == 200
     for path in ("/", "/answer", "/events", "/wrong/", f"/{gridworld.token[:-1]}/", f"{token}"):
         assert call(gridworld, "GET", path)[0] == 403
     assert call(gridworld, "POST", "/wrong/answer", good)[0] == 403

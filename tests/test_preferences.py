@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bayespbrl.preferences import Answer, Preferences, pair_differences, parse_answer
+from bayespbrl.preferences import Answer, Preferences, opponent_now, pair_differences, parse_answer
+from bayespbrl.trajectories import Trajectory
 
 
 def test_a_better_newcomer_is_preferred_over_every_undominated_one_and_replaces_them():
@@ -30,6 +31,27 @@ def test_only_rivals_of_the_same_start_are_compared_and_the_others_stand():
     assert worse == Preferences(((2, 7),), (0, 3, 2), 5)
     never_shown = before.add(7, 5, preferred=None, rivals=[])
     assert never_shown == Preferences((), (0, 2, 3, 5, 7), 5, ((7, 5),))
+
+
+def test_an_opponent_that_another_question_of_the_iteration_has_beaten_stays_beaten():
+    before = Preferences().add(5, 0, preferred=5, rivals=[])
+    for rivals in ([], [5], [0]):
+        better = before.add(3, 0, preferred=3, rivals=rivals)
+        assert (better.pairs, better.undominated) == (((5, 0), (3, 0)), (5, 3))  # nothing is known of 3 and 5
+        worse = before.add(3, 0, preferred=0, rivals=rivals)
+        assert (worse.pairs, worse.undominated) == (((5, 0), (0, 3)), (5,))
+
+
+def test_a_beaten_opponent_gives_way_to_who_stands_for_its_start():
+    here, there = (
+        Trajectory(states=np.array([[start], [0.0]]), actions=np.zeros((1, 1)), rewards=np.zeros(1), terminated=False)
+        for start in (1.0, 2.0)
+    )
+    known, opponents = [here, here, here, there, there], {1: 0, 2: 0, 4: 3}
+    beaten = Preferences().add(1, 0, preferred=1, rivals=[]).add(4, 3, preferred=3, rivals=[])
+    assert [opponent_now(new, opponents, known, Preferences()) for new in (1, 2, 4)] == [0, 0, 3]
+    assert opponent_now(2, opponents, known, beaten) == 1
+    assert opponent_now(2, {}, known, beaten) == 3
 
 
 def test_the_side_is_known_of_what_was_asked_and_of_nothing_that_follows():

@@ -143,7 +143,7 @@ def test_pairs_of_trials_are_counted_by_the_answers_that_they_needed(made):
 
 def test_predictions_are_pooled_over_tasks_and_not_over_methods():
     *of_tasks, pooled = calibration_table(read_study(STUDIES / "tasks")).to_dict("records")
-    assert (pooled["tasks"], len(of_tasks)) == ("all", 3)
+    assert (pooled["tasks"], len(of_tasks)) == ("all", 2)
     for count in ("runs", "answers predicted"):
         assert int(pooled[count]) == sum(int(line[count]) for line in of_tasks)
     errors = [float(line["ECE"]) for line in of_tasks]
@@ -198,6 +198,21 @@ def test_a_performance_profile_averages_tasks_and_not_trials():
     profile = performance_profile(relative, np.array([-0.1, 0.5, 1.0]))
     np.testing.assert_allclose(profile.share, [1.0, 0.75, 0.0])
     assert profile.low[1] < 0.75 < profile.high[1]
+
+
+def test_a_performance_profile_draws_the_trials_of_each_task_anew():
+    """Otherwise the tasks below, one the other's mirror image, would have a share of one half in each resample."""
+    values = np.repeat([0.0, 1.0], 10)
+    profile = performance_profile({"one": values, "other": values[::-1]}, np.array([0.5]))
+    assert profile.low[0] < 0.45 < 0.55 < profile.high[0]
+
+
+def test_a_level_may_be_called_none(made):
+    lines = pd.read_csv(made / "iterations.csv")
+    lines.assign(methods=lines["methods"].replace("first", "None")).to_csv(made / "iterations.csv", index=False)
+    declared = made / "study.toml"
+    declared.write_text(declared.read_text().replace("methods.first", "methods.None"))
+    assert values_table(read_study(made))["methods"].to_list()[0] == "None"
 
 
 DAMAGE = {

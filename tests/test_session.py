@@ -1,8 +1,10 @@
 """A sitting without a browser: turns, what is computed ahead, clips, the widget, and the command line around them."""
 
 import errno
+import fcntl
 import io
 import json
+import os
 import subprocess
 import sys
 import time
@@ -32,6 +34,7 @@ from bayespbrl.people.session import Session, answer_of
 from bayespbrl.people.views import ALL_GIVEN, FINISHED, LITTLE, QUESTION, THINKING, said_of, with_ties
 from bayespbrl.people.widget import ComparisonWidget
 from bayespbrl.preferences import Answer, Query
+from bayespbrl.runs import lock
 from bayespbrl.runs.lock import continuing
 from bayespbrl.trajectories import Trajectory
 
@@ -704,6 +707,25 @@ def test_a_run_that_is_continued_elsewhere_is_refused(monkeypatch, capsys, direc
             )
     with continuing(directory):
         pass
+
+
+def test_a_file_system_without_locks_is_no_other_program(directory, monkeypatch):
+    def refuses(file, operation):
+        raise OSError(errno.ENOLCK, "no locks available")
+
+    monkeypatch.setattr(lock.fcntl, "flock", refuses)
+    with continuing(directory):
+        pass
+
+
+def test_a_lock_is_of_a_file_that_may_be_written(directory, monkeypatch):
+    """NFS refuses an exclusive lock of any other."""
+    modes = []
+    monkeypatch.setattr(
+        lock.fcntl, "flock", lambda file, _: modes.append(fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE)
+    )
+    with continuing(directory):
+        assert modes == [os.O_RDWR]
 
 
 def test_a_run_that_nobody_can_be_asked_about_is_refused(monkeypatch, capsys, directory, tmp_path):

@@ -105,13 +105,26 @@ def test_an_unknown_option_is_refused_by_name():
         settings_for("gridworld", kl_bond=0.3)
 
 
-def test_changes_win_over_presets_and_none_changes_nothing():
-    preset = settings_for("gridworld", preset="paper")
-    assert settings_for("gridworld", preset="paper", kl_bound=None, seed=None, iterations=None) == preset
+def test_changes_win_over_presets_none_too():
+    assert settings_for("gridworld", answers=None, iterations=40).questions.answers is None
+    with pytest.raises(ValueError, match=r"kl_bound: expected .* got None"):
+        settings_for("gridworld", kl_bound=None)
     assert settings_for("gridworld", iterations=7).iterations == 7
     paper = settings_for("SomebodysEnv-v3", preset="paper", hyperparameters="inferred")
     assert paper == Settings("SomebodysEnv-v3", preset="paper")
     assert settings_for("SomebodysEnv-v3") == Settings.from_options("SomebodysEnv-v3", DEFAULT)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"seed": 2**63}, "seed: expected at most 9223372036854775807"),
+        ({"wrong_answers": 0.3, "expert": "page"}, "wrong_answers: expected 0 with the expert page, got 0.3"),
+    ],
+)
+def test_options_that_could_have_no_effect_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        settings_for("gridworld", **options)
 
 
 def test_steepness_and_lapse_rate_are_inferred_unless_they_or_all_hyperparameters_are_given():

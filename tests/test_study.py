@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -18,10 +19,12 @@ from test_trials import ThisProcess, without_processes
 
 import bayespbrl
 from bayespbrl import runs
+from bayespbrl.results.study_data import read_study
 from bayespbrl.studies import Study, declared, rows
 from bayespbrl.studies.cluster import scheduler_executor
 from bayespbrl.studies.declaration import parsed, shipped
 from bayespbrl.studies.engine import Engine, Progress
+from bayespbrl.studies.machine import source_digest
 from bayespbrl.studies.processes import trial_processes
 from bayespbrl.studies.rows import Seeds, row_of, run_trial
 from bayespbrl.studies.tables import measure_first_policy
@@ -111,6 +114,34 @@ def test_a_second_call_computes_nothing_again_and_more_trials_may_follow(finishe
     assert Study.prepare(parsed(DECLARATION, "tiny"), copy, trials=3).finished == 6
 
 
+def test_a_finished_study_keeps_where_it_is_from_and_a_continued_one_names_both(finished, tmp_path, monkeypatch):
+    without_processes(monkeypatch)
+    copy = shutil.copytree(finished, tmp_path / "study")
+    kept = json.loads((copy / "study.json").read_text()) | {"source": "older", "date": "2026-01-01"}
+    (copy / "study.json").write_text(json.dumps(kept))
+    Study.prepare(parsed(DECLARATION, "tiny"), copy).run()
+    assert json.loads((copy / "study.json").read_text()) == kept
+    shutil.rmtree(copy / "gridworld/linear-program/none/seed-2981")
+    for _ in range(2):
+        Study.prepare(parsed(DECLARATION, "tiny"), copy).run()
+        now = json.loads((copy / "study.json").read_text())
+        assert now["source"] == source_digest()
+        assert [(part["source"], part["date"]) for part in now["earlier"]] == [("older", "2026-01-01")]
+    assert "some trials: source older, 2026-01-01" in read_study(copy).source
+
+
+def test_a_row_that_hardly_ever_meets_a_preference_is_reported_and_the_others_go_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(rows, "MOST_SEEDS_A_TRIAL", 2)
+    good = Seeds(row_of("gridworld", tmp_path / "good", TINY, seed=5, name="good"), 1)
+    bad = Seeds(replace(good.row, directory=tmp_path / "bad", name="bad", preference_within=1), 1)
+    bad.outcomes.update({5: False, 6: False})
+    failures = Engine([bad, good], Dies({})).run()
+    assert [str(failure) for failure in failures] == [
+        "bad seed 5: expected 1 trials with a preference within 1 iterations, got none in 2 of 2"
+    ]
+    assert good.with_outcome(True) == [5]
+
+
 @pytest.mark.parametrize("name", shipped())
 def test_every_shipped_study_is_one(name):
     declaration = declared(name)
@@ -129,6 +160,8 @@ BAD = [
     ("[tasks.gridworld]\n[noise]\nfew = 3", "noise.few: expected a table, got 3"),
     ("[tasks.gridworld]\n[[leave_out]]\ntasks = ['nowhere']", "leave_out: expected a list of tasks among gridworld"),
     ("[tasks.gridworld]\n[[leave_out]]\ntasks = ['gridworld']", "all are left out"),
+    ("leave_out = 5\n[tasks.gridworld]", "leave_out: expected a list of tables, got 5"),
+    ("[tasks.gridworld]\n[[leave_out]]\ntasks = [['a']]", "leave_out: expected a list of tasks among gridworld"),
     ("[tasks.'../up']", "expected a name of letters"),
 ]
 

@@ -2,7 +2,7 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -115,6 +115,11 @@ def _takes_run_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+def _given(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that are on the command line."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
 @app.command()
 @_takes_run_options
 def run(
@@ -135,7 +140,7 @@ def run(
                 f"{name}: expected --no-{name} only with the expert page, got the expert {expert or 'return'}"
             )
     directory = out or fresh_directory(env)
-    learner = runs.start(env, directory, seed=seed, **options)
+    learner = runs.start(env, directory, seed=seed, **_given(options))
     with continuing(directory):
         place = Place(browser=browser)
         run_to_the_end(learner, directory, answerers=answerer or [], practice=practice, place=place)
@@ -213,8 +218,8 @@ def trials(
     with progress_bar() as bar:
         task = bar.add_task("trials", total=number, state=f"{directory}")
         try:
-            seeds = range(seed, seed + number)
-            study = run_trials(env, directory, seeds=seeds, jobs=jobs, progress=lambda _: bar.advance(task), **options)
+            seeds, given = range(seed, seed + number), _given(options)
+            study = run_trials(env, directory, seeds=seeds, jobs=jobs, progress=lambda _: bar.advance(task), **given)
         except KeyboardInterrupt:
             console.print("Stopped. Nothing is lost: repeat the command to continue.")
             raise
@@ -239,6 +244,8 @@ def study(
 ) -> None:
     """Run a declared study: tasks, methods, noise, seeds. Finished cells are not repeated."""
     checks.whole("jobs", jobs)
+    if scheduler and jobs > 1:
+        raise ValueError(f"jobs: expected none with a scheduler, whose workers run the trials, got {jobs}")
     declaration = declared(name)
     prepared = Study.prepare(declaration, out or Path("runs") / f"study-{declaration.name}", trials=number)
     show_plan(prepared, jobs)

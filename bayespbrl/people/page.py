@@ -240,7 +240,7 @@ class Guard:
 
 
 def _is_address(name: str, host: str) -> bool:
-    if name in ("localhost", host, socket.gethostname()):
+    if name.lower() in ("localhost", host.lower(), socket.gethostname().lower()):  # browsers write names in lower case
         return True
     try:
         address = ipaddress.ip_address(name)

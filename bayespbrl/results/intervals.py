@@ -23,9 +23,9 @@ class Interval(NamedTuple):
     high: float
 
 
-def resamples(number: int, *, samples: int = RESAMPLES) -> np.ndarray:
-    """Bootstrap rows, the same for the same number of trials, shape (samples, number)."""
-    return np.random.default_rng(0).integers(number, size=(samples, number))
+def resamples(number: int, *, samples: int = RESAMPLES, seed: int = 0) -> np.ndarray:
+    """Bootstrap rows, the same for the same number of trials and seed, shape (samples, number)."""
+    return np.random.default_rng(seed).integers(number, size=(samples, number))
 
 
 def median_interval(values: np.ndarray) -> Interval:
@@ -137,10 +137,10 @@ def performance_profile(relative: Mapping[str, np.ndarray], levels: np.ndarray) 
     statistical precipice", section 4.2, eq. 2.
     """
     shares, samples = [], []
-    for values in relative.values():
+    for stratum, values in enumerate(relative.values()):
         above = np.asarray(values, dtype=np.float64)[:, None] > levels  # Agarwal et al. (2021), eq. 2
         shares.append(above.mean(axis=0))
-        samples.append(above[resamples(len(values), samples=PROFILE_RESAMPLES)].mean(axis=1))
+        samples.append(above[resamples(len(values), samples=PROFILE_RESAMPLES, seed=stratum)].mean(axis=1))
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(np.mean(samples, axis=0), [tail, 1 - tail], axis=0)
     return Profile(levels, np.mean(shares, axis=0), low, high)

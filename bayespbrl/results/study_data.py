@@ -99,9 +99,13 @@ class StudyData:
     def source(self) -> str:
         """Study, command, version, date and machine, for the caption of a table."""
         kept = self.description
+        earlier = "".join(
+            f"; some trials: source {part.get('source')}, {part.get('date')}, {part.get('machine')}"
+            for part in kept.get("earlier", [])
+        )
         return (
             f"Study `{self.name}` (`{kept.get('command')}`), version {kept.get('version')} (source "
-            f"{kept.get('source')}), {kept.get('date')}, {kept.get('machine')}."
+            f"{kept.get('source')}), {kept.get('date')}, {kept.get('machine')}{earlier}."
         )
 
 
@@ -131,12 +135,13 @@ def read_study(directory: Path | str) -> StudyData:
 
 def _read(file: Path, columns: list[str]) -> pd.DataFrame:
     try:
-        table = pd.read_csv(file, dtype=dict.fromkeys(AXES, str), keep_default_na=True)
+        # a level may be called None or NA
+        missing = {name: [""] for name in (*ITERATION_COLUMNS, *ANSWER_COLUMNS, *FIGURES) if name not in AXES}
+        table = pd.read_csv(file, dtype=dict.fromkeys(AXES, str), keep_default_na=False, na_values=missing)
     except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
         raise ValueError(f"{file}: expected a table, got {' '.join(str(error).split())}") from error
-    if missing := [name for name in columns if name not in table]:
-        raise ValueError(f"{file}: expected the columns {', '.join(columns)}, got none of {', '.join(missing)}")
-    table[list(AXES)] = table[list(AXES)].fillna("")
+    if absent := [name for name in columns if name not in table]:
+        raise ValueError(f"{file}: expected the columns {', '.join(columns)}, got none of {', '.join(absent)}")
     for name in ("seed", "iteration", "answers", "value", "predicted"):
         if len(table) and name in table and not pd.api.types.is_numeric_dtype(table[name]):
             raise ValueError(f"{file}: expected numbers as {name}, got {table[name].dtype}")

@@ -19,17 +19,19 @@ def continuing(directory: Path | str) -> Iterator[None]:
       ValueError: another process continues the run, or the directory is no run.
     """
     try:
-        held = os.open(Path(directory) / "settings.json", os.O_RDONLY)
+        held = os.open(Path(directory) / "settings.json", os.O_RDWR)  # NFS locks only what may be written
     except OSError as error:
         raise ValueError(f"{directory}: expected a run directory with its settings.json, got {error}") from error
     try:
         if fcntl is not None:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+            except BlockingIOError as error:
                 raise ValueError(
                     f"{directory}: expected a run that no other program continues, got one that does; stop it first"
                 ) from error
+            except OSError:  # a file system without locks, where the log's own check has to do
+                pass
         yield
     finally:
         os.close(held)

@@ -144,6 +144,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         checks.whole("seed", self.seed, 0)
+        if self.seed > MOST_SEED:
+            raise ValueError(f"seed: expected at most {MOST_SEED}, got {self.seed}")
         checks.one_of("preset", self.preset, presets.NAMES)
         if self.iterations is not None:
             checks.whole("iterations", self.iterations)
@@ -165,6 +167,8 @@ class Settings:
             raise ValueError(f"plain_draws: expected numbers as steepness and lapse_rate, got {given}")
         if query == "information-when-unsure" and schedule != "confidence":
             raise ValueError(f"schedule: expected confidence with the query rule {query}, got {schedule!r}")
+        if self.wrong_answers and self.expert not in SIMULATED:
+            raise ValueError(f"wrong_answers: expected 0 with the expert {self.expert}, got {self.wrong_answers}")
         number = self.rollouts.trajectories_per_iteration
         for name, limit in (("queries_per_iteration", number), ("first_queries", number - 1)):
             if (value := getattr(self.questions, name)) > limit:
@@ -255,6 +259,7 @@ PARTS: dict[str, type[Any]] = {
     "rollouts": Rollouts,
     "questions": Questions,
 }
+MOST_SEED = 2**63 - 1
 # The part that reads each option; "" for the run's own. The tie threshold has none: a run infers it.
 OPTIONS: dict[str, str] = {f.name: "" for f in fields(Settings) if f.name not in ("env", *PARTS)} | {
     option.name: part for part, kind in PARTS.items() for option in fields(kind) if option.name != "tie_threshold"
@@ -262,7 +267,7 @@ OPTIONS: dict[str, str] = {f.name: "" for f in fields(Settings) if f.name not in
 
 
 def settings_for(env: str, *, task: Task | None = None, **changes: Any) -> Settings:
-    """The preset for an environment with `changes`; None changes nothing.
+    """The preset for an environment with `changes`.
 
     Args:
       env: short name or gymnasium id.
@@ -272,5 +277,4 @@ def settings_for(env: str, *, task: Task | None = None, **changes: Any) -> Setti
     Raises:
       ValueError: as `Settings.from_options`.
     """
-    chosen = {name: value for name, value in changes.items() if value is not None}
-    return Settings.from_options(env, preset_options(env, chosen, task) | chosen)
+    return Settings.from_options(env, preset_options(env, changes, task) | changes)

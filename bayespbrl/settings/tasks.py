@@ -3,12 +3,17 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box
 from jaxtyping import Float
+
+from bayespbrl.envs.stepping import random_episodes
+from bayespbrl.rollouts import step_limit
 
 # Trajectories of an iteration where actions are continuous; steps that the first ones should have in all, and the most
 # trajectories that an iteration may take for them.
@@ -33,6 +38,12 @@ class Task:
     action_space: Space[Any]
     horizon: int
     random_episodes: Callable[[int, int], list[Float[np.ndarray, "t d"]]] | None = None
+
+    @classmethod
+    def of(cls, environment: gymnasium.Env, max_steps: int | None = None) -> "Task":
+        """The properties of an environment; `ValueError` where no time limit is known."""
+        horizon, measured = step_limit(environment, max_steps), partial(random_episodes, environment)
+        return cls(environment.observation_space, environment.action_space, horizon, measured)
 
     def derived(self, *, people: bool) -> dict[str, Any]:
         """Options by spaces and horizon, and by whether people answer (they wait).

@@ -143,7 +143,9 @@ def parsed(text: str, name: str) -> Declaration:
     if not content.get("tasks"):
         raise ValueError(f"{where}: expected at least one task, got none")
     common = _options(f"{where}, options", _table(f"{where}, options", content.get("options", {})))
-    left_out = [_left_out(where, entry, axes) for entry in content.get("leave_out", [])]
+    if not isinstance(entries := content.get("leave_out", []), list):
+        raise ValueError(f"{where}, leave_out: expected a list of tables, got {entries!r}")
+    left_out = [_left_out(where, entry, axes) for entry in entries]
     rows = tuple(
         _row(common, chosen)
         for chosen in product(*(axis.items() for axis in axes))
@@ -204,7 +206,7 @@ def _left_out(where: str, entry: Any, axes: list[dict[str, Options]]) -> list[li
     chosen = []
     for axis, levels in zip(AXES, axes, strict=True):
         names = entry.get(axis, list(levels))
-        if not isinstance(names, list) or any(name not in levels for name in names):
+        if not isinstance(names, list) or any(name not in list(levels) for name in names):
             raise ValueError(f"{place}: expected a list of {axis} among {', '.join(levels)}, got {names!r}")
         chosen.append(names)
     return chosen

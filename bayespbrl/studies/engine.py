@@ -97,6 +97,12 @@ class Engine:
         new = [
             (seed - row.row.settings.seed, place, seed) for place, row in enumerate(self.rows) for seed in row.to_do()
         ]
+        given_up = [failure.row for failure in self.failures]
+        self.failures += [
+            Failure(row.row, row.row.settings.seed, row.exhausted)
+            for row in self.rows
+            if row.exhausted and row.row not in given_up
+        ]
         for _, place, seed in sorted(new):
             if (place, seed) not in self._starts:
                 self._submit(place, seed)

@@ -11,10 +11,10 @@ import xarray as xr
 from bayespbrl import checks, runs
 from bayespbrl.envs.opening import environment_name, open_environment
 from bayespbrl.experts import SIMULATED
-from bayespbrl.learner import Learner, task_of
+from bayespbrl.learner import Learner
 from bayespbrl.runs.directory import RunDirectory, read_summary
 from bayespbrl.runs.simulated import expert_of
-from bayespbrl.settings import Settings, settings_for
+from bayespbrl.settings import Settings, Task, settings_for
 from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
     BALANCING_FILE,
@@ -107,7 +107,7 @@ def row_of(
     checks.optional(checks.whole, "preference_within", preference_within)
     environment = open_environment(env)
     identity = environment_name(environment)
-    first = settings_for(env, task=task_of(environment, options.get("max_steps")), **options, seed=seed)
+    first = settings_for(env, task=Task.of(environment, options.get("max_steps")), **options, seed=seed)
     environment.close()
     if first.expert not in SIMULATED:
         raise ValueError(f"expert: expected one of {', '.join(SIMULATED)}, which are simulated, got {first.expert!r}")
@@ -126,22 +126,20 @@ class Seeds:
     row: Row
     trials: int
     outcomes: dict[int, bool | None] = field(default_factory=dict)
+    exhausted: str = ""
 
     def with_outcome(self, outcome: bool | None) -> list[int]:
         return [seed for seed, reached in self.outcomes.items() if reached is outcome]
 
     def to_do(self) -> list[int]:
-        """The seeds of unfinished trials, after adding as many new seeds as are needed.
-
-        Raises:
-          ValueError: too few trials meet a preference.
-        """
+        """The seeds of unfinished trials, after adding as many new seeds as are needed; none once `exhausted`."""
         while len(self.outcomes) - len(redrawn := self.with_outcome(False)) < self.trials:
             if len(self.outcomes) >= MOST_SEEDS_A_TRIAL * self.trials:
-                raise ValueError(
+                self.exhausted = (
                     f"expected {self.trials} trials with a preference within {self.row.preference_within} iterations, "
                     f"got none in {len(redrawn)} of {len(self.outcomes)}"
                 )
+                return []
             seed = self.row.settings.seed + len(self.outcomes)
             self.outcomes[seed] = self.row.outcome(seed)
         return self.with_outcome(None)

@@ -1,7 +1,7 @@
 """A declared study on disk: a run directory for each cell, a copy of the declaration, one table.
 
 study.toml          the declaration
-study.json          study, version, command, machine, rounding, date
+study.json          study, version, source, command, machine, rounding, date; of cells made elsewhere, `earlier`
 iterations.csv      a line for each trial and iteration of the finished trials
 TASK/METHOD/…/seed-1000/   the run directories
 """
@@ -40,6 +40,7 @@ FIGURES = {
     "kl_bound": "kl_bound",
     "seconds": "seconds",
 }  # the columns of `iterations.csv` after the levels, the seed and the iteration, by the names in the summaries
+WHENCE = ("source", "machine", "rounding")
 SECONDS = ("seconds_utility", "seconds_improvement", "seconds_evaluation")
 
 
@@ -137,15 +138,18 @@ class Study:
           the trials that were given up; all others are finished.
         """
         with executor_for(jobs) as executor:
-            self._write_declaration(command)
+            if self.finished < self.cells or not (self.directory / "study.json").exists():
+                self._write_declaration(command)
             failures = Engine(self.rows, executor, progress).run()
         self.write_table()
         return failures
 
     def _write_declaration(self, command: str) -> None:
+        """`study.toml` and `study.json`, which keeps where earlier cells are from, if from elsewhere."""
         self.directory.mkdir(parents=True, exist_ok=True)
+        before = read_study_json(self.directory) if self.finished else {}
         write_file(self.directory / "study.toml", self.declaration.text)
-        content = {
+        content: dict[str, Any] = {
             "study": self.declaration.name,
             "title": self.declaration.title,
             "version": version("bayespbrl"),
@@ -157,6 +161,11 @@ class Study:
             "trials": self.trials,
             "seed": self.declaration.seed,
         }
+        earlier = list(before.get("earlier", []))
+        if before and any(before.get(name) != content[name] for name in WHENCE):
+            earlier.append({name: before.get(name) for name in (*WHENCE, "command", "date")})
+        if earlier:
+            content["earlier"] = earlier
         write_file(self.directory / "study.json", json.dumps(content, indent=1) + "\n")
 
     def write_table(self) -> None:
