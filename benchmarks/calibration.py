@@ -4,7 +4,8 @@
     python benchmarks/calibration.py runs/swing-up runs/gridworld …
 
 Each argument is a run directory or a folder of them, and becomes one row. An answer is predicted by the posterior that
-the learner had when it asked; the first iteration, in which it had none, is left out. `z` is the log score less its
+the learner had when it asked: which of the two is preferred, given that either is. The first iteration, in which it had
+none, is left out. `z` is the log score less its
 expectation under the predictions themselves, in standard deviations: below −2 the predictions are overconfident. `ECE`
 is the expected calibration error over bins of width 0.1 of the confidence, beside that of calibrated predictions by
 chance. The last column is the share of right predictions among those stated with at least 0.95.

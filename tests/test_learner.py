@@ -15,7 +15,7 @@ from toys import QUICK, Push, Slope, fingerprint
 
 from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, questions, resume, rollouts, start
 from bayespbrl import cycle as cycle_module
-from bayespbrl.diagnostics.estimates import first_preferred_probability
+from bayespbrl.diagnostics.estimates import predicted_answer
 from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.improvement.update import NEARLY
@@ -226,7 +226,7 @@ def test_bound_question_and_prediction_are_all_of_the_runs_one_posterior():
             new, run.trajectories, shown, incumbent, estimate, None, run.cycle._rng(1, 2)
         )
         orders.append(queries.candidates(run.cycle.query_rule, situation))
-        predicted.append(first_preferred_probability(estimate, *question.trajectories))
+        predicted.append(predicted_answer(estimate, *question.trajectories)[0])
     assert bounds[0].statistics["agreement"] > 0.5 > bounds[1].statistics["agreement"]
     collected = [entry.event for entry in log.entries if entry.event["event"] == "collected"]
     assert list(orders[0]) == collected[-1]["candidates"]

@@ -32,6 +32,7 @@ from bayespbrl.diagnostics.report.warnings import find_warnings
 from bayespbrl.diagnostics.report.write import assembled, write_report
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.models.likelihoods import log_prob
+from bayespbrl.preferences import Answer
 from bayespbrl.runs.iteration_files import read_iteration
 from bayespbrl.trajectories import trajectory_features
 
@@ -201,8 +202,14 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(g
     both = [run.trajectories[asked[name]] for name in ("first", "second")]
     sums = trajectory_features(both, parts["estimate"].features, discount=run.settings.critic.discount)
     difference = (sums[[0]] - sums[[1]]) / parts["estimate"].scales[0]
-    expected = answer_probabilities(parts["estimate"].posterior, difference)[0, 0 if said == "first" else 1]
-    assert float(table["before"][3]) == pytest.approx(expected)
+    first, second, tie = answer_probabilities(parts["estimate"].posterior, difference)[0]
+    assert tie > 0.01
+    assert float(table["before"][3]) == pytest.approx(first if said == "first" else second)
+    answer = contents.answers[3]
+    for other, probability in ((Answer.FIRST, first), (Answer.SECOND, second)):
+        assert replace(answer, answer=other).before == pytest.approx(probability)
+    # scored is which of the two was preferred
+    assert answer.predicted == pytest.approx(first / (first + second))
     assert float(table["probability"][3]) == pytest.approx(
         likelihood[len(run.preferences.pairs) - 1]
     )  # the ties come last

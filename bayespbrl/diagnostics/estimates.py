@@ -3,7 +3,7 @@
 import numpy as np
 from xarray import DataTree
 
-from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities
+from bayespbrl.diagnostics.predictions import DOMINATED, PREFERRED, answer_probabilities
 from bayespbrl.models import Answers
 from bayespbrl.models.posterior_tree import answers_of
 from bayespbrl.trajectories import Trajectory
@@ -24,18 +24,23 @@ def expect_estimate(estimate: UtilityEstimate | None) -> UtilityEstimate:
     return estimate
 
 
-def first_preferred_probability(
+def predicted_answer(
     estimate: UtilityEstimate, first: Trajectory, second: Trajectory, *, answerer: str | None = None
-) -> float:
-    """Posterior predictive probability that the first of two trajectories, which is shown first, is preferred.
+) -> tuple[float, float]:
+    """Posterior predictive probability that the first of two trajectories, shown first, is preferred, if either is.
 
     Args:
       estimate: with a posterior.
       answerer: who is asked; a name that the posterior does not know, or None, is any of its answerers.
+
+    Returns:
+      that, and the probability that either is preferred: 1 where nobody called two equal so far.
     """
     estimate, posterior = expect_posterior(estimate)
     names = answers_of(posterior).names or ()
     who = np.array([answerer]) if answerer in names else None
     answers = Answers(shown_first=np.ones(1, int), answerers=who)
     differences = estimate.differences([first, second])
-    return float(answer_probabilities(posterior, differences, answers)[0, PREFERRED])
+    chances = answer_probabilities(posterior, differences, answers)[0]
+    stated = float(chances[PREFERRED] + chances[DOMINATED])
+    return float(chances[PREFERRED]) / stated, stated

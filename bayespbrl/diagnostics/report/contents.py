@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from gymnasium.experimental.functional import FuncEnv
 
-from bayespbrl.diagnostics.estimates import first_preferred_probability
+from bayespbrl.diagnostics.estimates import predicted_answer
 from bayespbrl.diagnostics.predictions import fitted_model
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
@@ -247,7 +247,8 @@ def _predicted(contents: RunContents, answer: AnsweredQuestion) -> AnsweredQuest
         return replace(answer, predicted=0.5)  # without any answer, either is equally probable
     if contents.posterior is None or contents.features_missing:
         return answer
-    return replace(answer, predicted=first_preferred_probability(contents.estimate, *both, answerer=answer.answerer))
+    predicted, stated = predicted_answer(contents.estimate, *both, answerer=answer.answerer)
+    return replace(answer, predicted=predicted, stated=stated)
 
 
 def _damaged(contents: RunContents, what: str, remedy: str) -> RunContents:

@@ -30,8 +30,9 @@ class AnsweredQuestion:
       first, second: numbers of the two trajectories in the order shown.
       answer: the expert's.
       row: which of the K ordered pairs it is; None where it gave none (a tie, a skip).
-      predicted: probability that the first is preferred, by the estimate that the learner had when it was answered; NaN
-        where that has no posterior or cannot be read.
+      predicted: probability that the first is preferred, given that either is, by the estimate that the learner had
+        when it was answered; NaN where that has no posterior or cannot be read.
+      stated: probability that either is, by the same.
       answerer, seconds: who answered, and how long they took; None where that is not known.
     """
 
@@ -42,6 +43,7 @@ class AnsweredQuestion:
     answer: Answer
     row: int | None
     predicted: float = float("nan")
+    stated: float = 1.0
     answerer: str | None = None
     seconds: float | None = None
 
@@ -50,7 +52,7 @@ class AnsweredQuestion:
         """The predicted probability of the answer that was given; NaN where the model does not use it."""
         if self.row is None:
             return float("nan")
-        return self.predicted if self.answer is Answer.FIRST else 1 - self.predicted
+        return self.stated * (self.predicted if self.answer is Answer.FIRST else 1 - self.predicted)
 
 
 @dataclass(frozen=True)
