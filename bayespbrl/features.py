@@ -321,7 +321,7 @@ def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."
     name = getattr(features, "__name__", type(features).__name__)
     if not callable(features):
         raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
-    values = np.asarray(features(np.asarray(states)))
+    values = np.asarray(features(np.array(states)))  # a copy, which the function may change
     if values.ndim != 2 or len(values) != len(states) or values.shape[1] == 0:
         raise ValueError(f"features {name}: expected shape ({len(states)}, D), got {values.shape}")
     if not (np.issubdtype(values.dtype, np.number) or values.dtype == bool) or np.iscomplexobj(values):

@@ -237,7 +237,7 @@ class Preferences:
         after = replace(self, pairs=pairs, ties=ties, answers=self.answers + 1)
         return after._with_sources(self, asked, first, answerer)
 
-    def without(self, answerer: str) -> "Preferences":
+    def without(self, answerer: str | None) -> "Preferences":
         """The preferences without one person's answers; the undominated trajectories stay.
 
         Raises:

@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Int, Key, Shaped
 
 from bayespbrl.checks import whole
 from bayespbrl.envs import functional
+from bayespbrl.envs.functional import FunctionalEnv
 from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, environment_name, open_environment
 from bayespbrl.envs.stepping import episodes_by_interface, outside_of
 from bayespbrl.policies.policy import AnyArray, Sampler
@@ -166,11 +167,12 @@ def _layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
 
 
 def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
-    """The pure functions; None where a wrapper around them, such as a user's, may change the environment."""
+    """The pure functions; None where a wrapper or subclass, such as a user's, may change the environment."""
     *wrappers, inner = _layers(env)
-    dynamics = getattr(inner, "dynamics", None)
     harmless = all(isinstance(layer, TimeLimit | OrderEnforcing | PassiveEnvChecker) for layer in wrappers)
-    return dynamics if isinstance(dynamics, FuncEnv) and harmless and _is_pytree(policy) else None
+    if not (isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and harmless and _is_pytree(policy)):
+        return None
+    return inner.dynamics
 
 
 def _is_pytree(policy: Sampler) -> bool:

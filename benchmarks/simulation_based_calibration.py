@@ -219,8 +219,8 @@ def _plant(bug: str) -> None:
     elif bug == "narrow":
         original = low_rank.UtilityWeights.__init__
 
-        def narrower(self: Any, *arguments: Any, prior_scale: float, seed: int) -> None:
-            original(self, *arguments, prior_scale=prior_scale / 2, seed=seed)
+        def narrower(self: Any, *arguments: Any, prior_scale: float, **options: Any) -> None:
+            original(self, *arguments, prior_scale=prior_scale / 2, **options)
 
         setattr(low_rank.UtilityWeights, "__init__", narrower)  # noqa: B010
     elif bug == "unmoved":

@@ -26,7 +26,8 @@ from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.diagnostics.report.people import people_warnings
 from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.events import Entry, LearnerState, apply
-from bayespbrl.models import sample_posterior
+from bayespbrl.models import PreferenceModel, sample_posterior
+from bayespbrl.models.posterior_tree import utility_margins
 from bayespbrl.preferences import PastQuestion, Source
 from bayespbrl.questions import LEAST_BETWEEN
 from bayespbrl.runs.answers_file import write_answers
@@ -351,11 +352,11 @@ def test_the_report_of_a_run_of_people_says_what_to_do_about_each(answered_by_tw
     assert not any(what.startswith("Ada") for what in found)
 
 
-def advised(past, lapse_rates):
-    """The advice on each person, by the draws of their lapse rates."""
+def advised(past, lapse_rates, *, given=None):
+    """The advice on each person, by the draws of their lapse rates; `given` is one that was set."""
     drawn = {"lapse_rate": (("chain", "draw", "answerer"), [np.transpose(list(lapse_rates.values()))])}
     posterior = xr.DataTree.from_dict({"/posterior": xr.Dataset(drawn, coords={"answerer": list(lapse_rates)})})
-    warnings = people_warnings(SimpleNamespace(past=past, posterior=posterior))
+    warnings = people_warnings(SimpleNamespace(past=past, posterior=posterior, model=PreferenceModel(lapse_rate=given)))
     return [(warning.what, warning.remedy) for warning in warnings]
 
 
@@ -368,6 +369,9 @@ def test_whoever_mostly_tosses_coins_is_to_be_dropped_and_who_often_does_to_be_t
     assert trust[0].startswith("Bob: 30 % of the answers look random")
     assert trust[1].startswith("The posterior already trusts them less.")
     assert [remedy for _, remedy in advised(answers[:1], {"Ada": surely})] == ["Start a new run with someone else."]
+    assert advised(answers, {"Ada": surely, "Bob": often, "Cy": never}, given=0.7) == []  # no answer decided on it
+    (unnamed, *_) = advised([answers[0]._replace(answerer=None), answers[1]], {"": surely, "Bob": never})
+    assert unnamed[1] == "Drop them. run.estimate_without(None) infers the utility without them."
 
 
 def test_whoever_contradicts_themselves_is_asked_again_and_who_cannot_tell_is_shown_more():
@@ -484,3 +488,15 @@ def test_a_bad_table_of_answers_is_refused_by_its_line(tmp_path, text, expected)
     assert str(refused.value).startswith(str(tmp_path / "answers.csv"))
     with pytest.raises(ValueError, match=r"missing\.csv: "):
         read_answers(tmp_path / "missing.csv")
+
+
+def test_the_margin_of_a_report_is_of_the_utility_without_the_side():
+    """The same pair, answered by the side: what the answerer adds for it is no utility."""
+    rows = np.array([[0.5, 0.1], [0.5, 0.1], [-0.5, -0.1], [-0.5, -0.1]])
+    sampled = {"likelihood": "logistic", "num_samples": 100, "max_samples": 100, "seed": 0}
+    for answerers in (None, ["Ada", "Bob", "Ada", "Bob"]):
+        tree = sample_posterior(rows, shown_first=[1, 1, 1, 1], answerers=answerers, **sampled)
+        margins, utility = tree["posterior/margins"].values, utility_margins(tree)
+        weights = tree["posterior/utility_weights"].values
+        np.testing.assert_allclose(utility, weights @ rows.T, atol=1e-9)
+        assert margins.mean() > utility.mean() + 0.05

@@ -16,9 +16,12 @@ from toys import Push
 import bayespbrl
 from bayespbrl import rollouts
 from bayespbrl.envs import functional, opening
+from bayespbrl.envs.gridworld import Gridworld
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.envs.stepping import random_episodes
+from bayespbrl.features import checked_features
 from bayespbrl.rollouts import returns, rollout
+from bayespbrl.settings import Task
 
 KEY = jax.random.key(5)
 
@@ -30,6 +33,15 @@ class Table:
 
     def sample(self, key, observation):
         return jax.random.categorical(key, jnp.log(self.probabilities[observation]))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Constant:
+    action: np.ndarray
+
+    def sample(self, key, observation):
+        return self.action
 
 
 @jax.tree_util.register_dataclass
@@ -237,6 +249,87 @@ def test_users_wrappers_are_not_bypassed():
     env = gymnasium.wrappers.TransformReward(gymnasium.make("bayespbrl/Gridworld-v0"), lambda reward: -reward)
     trajectory = rollout(env, UNIFORM_TABLE, key=KEY, episodes=1, max_steps=20)[0]
     assert np.all(trajectory.rewards < 0)
+
+
+class OneStep(Gridworld):
+    """A user's subclass, which rewards and ends otherwise."""
+
+    def step(self, action):
+        observation, _, _, truncated, info = super().step(action)
+        return observation, 7.0, True, truncated, info
+
+
+def test_users_subclasses_are_not_bypassed():
+    trajectory = rollout(OneStep(), UNIFORM_TABLE, key=KEY, episodes=1, max_steps=20)[0]
+    assert (trajectory.rewards.tolist(), trajectory.terminated) == ([7.0], True)
+
+
+class Meddling(gymnasium.Env):
+    """Discrete observations, continuous actions that it changes in place, and infos that grow."""
+
+    observation_space, action_space = Discrete(3, start=2), Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.steps = 0, 0
+        return np.int64(2), {}
+
+    def step(self, action):
+        action *= 5
+        self.steps += 1
+        self.place = int(np.clip(self.place + np.sign(action[0]), 0, 2))
+        ended = self.steps >= self.np_random.integers(2, 6)
+        return np.int64(self.place + 2), float(self.place), ended, False, {"steps": np.arange(self.steps)}
+
+
+@pytest.fixture
+def meddling():
+    gymnasium.register("Meddling-v0", entry_point=Meddling, max_episode_steps=8)
+    yield "Meddling-v0"
+    del gymnasium.registry["Meddling-v0"]
+
+
+@pytest.mark.parametrize("by_name", [False, True])
+def test_an_environment_may_change_its_actions_and_give_any_infos(meddling, by_name):
+    env = open_environment(meddling if by_name else Meddling())
+    assert env.observation_space == Box(0, 1, (3,), np.float64)  # one-hot: no policy is a table of continuous actions
+    policy = Constant(np.array([0.5]))
+    episodes = rollout(env, policy, key=KEY, episodes=6, max_steps=8)
+    assert all(np.all(episode.actions == 0.5) for episode in episodes)
+    assert all(np.all(episode.states.sum(axis=1) == 1) for episode in episodes)
+
+
+def test_what_random_actions_do_is_measured_up_to_the_limit_that_is_asked_for():
+    env = open_environment("MountainCar-v0")
+    assert {len(states) - 1 for states in random_episodes(env, 260, time_limit=260)} == {260}
+    assert Task.of(env, 400).longer_hold()["exploration_hold"] > 1
+
+
+def test_observations_of_a_wrapper_have_no_period_of_the_dynamics():
+    made = gymnasium.make("bayespbrl/SwingUp-v0")
+    assert opening.environment_attribute(made, "observation_period") is not None
+    wrapped = open_environment(gymnasium.wrappers.TimeAwareObservation(made))
+    assert opening.environment_attribute(wrapped, "observation_period") is None
+
+
+@dataclass
+class ByValue(gymnasium.Env):
+    size: int = 3
+
+
+def test_an_environment_that_compares_by_value_is_named():
+    with pytest.raises(ValueError, match="environment ByValue: expected a class with a hash"):
+        open_environment(ByValue())
+
+
+def test_features_may_work_in_place():
+    def halved(states):
+        states /= 2
+        return states
+
+    states = np.ones((3, 1))
+    assert np.all(checked_features(halved, states) == 0.5)
+    assert np.all(states == 1)
 
 
 class Drifting(FuncEnv):

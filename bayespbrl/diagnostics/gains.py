@@ -53,6 +53,9 @@ def _stated_and_gained(summaries: Sequence[Mapping[str, Any]], statistic: str) -
     for before, after in pairwise(summaries):
         if after.get("restarted", -1) == before.get("iteration"):
             continue  # the policy was started anew in between
+        check = after.get("check") or {}
+        if check.get("stepped_back"):  # the update began with an earlier policy
+            before = {} if not check["best"] else summaries[check["best"] - 1]
         figures = [summary.get("value_newest", summary.get("value")) for summary in (before, after)]
         figures.append((after.get("schedule") or {}).get(statistic))
         if all(isinstance(figure, int | float) and np.isfinite(figure) for figure in figures):

@@ -102,9 +102,18 @@ class FunctionalEnv(gymnasium.Env):
             self._state, observation, reward, terminated = _step(self.dynamics, step_key, self._state, action)
         return self._observation(observation), float(reward), bool(terminated), False, {}
 
+    @property
+    def is_its_dynamics(self) -> bool:
+        """Whether it does what its dynamics do: no subclass has a `reset` or `step` of its own."""
+        mine = FunctionalEnv
+        return all(getattr(type(self), name) is getattr(mine, name) for name in ("reset", "step", "_observation"))
+
     def _observation(self, observation: Any) -> Any:
         if isinstance(self.observation_space, gymnasium.spaces.Discrete):
             self._observed = np.int64(observation)
+            return self._observed
+        if not isinstance(self.observation_space, gymnasium.spaces.Box):  # of several parts
+            self._observed = jax.tree.map(np.asarray, observation)
             return self._observed
         self._observed = np.array(observation, dtype=self.observation_space.dtype)
         return self._observed.copy()

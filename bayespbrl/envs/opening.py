@@ -15,10 +15,15 @@ from gymnasium.wrappers import TransformAction, TransformObservation
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.envs.functional import FunctionalEnv
 
+# Attributes of dynamics that are about their own observations.
+OF_OBSERVATIONS = ("observation_period", "observation_names", "draw", "draw_trajectory", "pose", "grid_shape")
 AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
 
 # Environments that we made from an id, and that can therefore be made again, N at a time.
 _MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
+_UNHASHABLE = (
+    "environment {}: expected a class with a hash, got one that compares by value; @dataclass(eq=False) does not"
+)
 # What `flattened` wrapped.
 _GIVEN: WeakKeyDictionary[gymnasium.Env, gymnasium.Env] = WeakKeyDictionary()
 
@@ -50,6 +55,8 @@ def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
         _MADE_FROM[opened] = spec
         return opened
     if isinstance(environment, FuncEnv):
+        if type(environment).__hash__ is None:
+            raise ValueError(_UNHASHABLE.format(type(environment).__name__))
         return flattened(FunctionalEnv(environment))
     if isinstance(environment, gymnasium.Env):
         return flattened(environment)
@@ -99,7 +106,12 @@ def _same(first: Any, second: Any) -> bool:
 
 
 def environment_attribute(env: gymnasium.Env, name: str) -> Any:
-    """An attribute that the environment's dynamics have beyond gymnasium's, as `optimal_return`; None without it."""
+    """An attribute that the environment's dynamics have beyond gymnasium's, as `optimal_return`; None without it.
+
+    None too where it is about the observations, and a wrapper gives others.
+    """
+    if name in OF_OBSERVATIONS and as_given(env).observation_space != env.unwrapped.observation_space:
+        return None
     return getattr(getattr(env.unwrapped, "dynamics", None), name, None)
 
 
@@ -134,6 +146,8 @@ def _one_line(value: object) -> str:
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
     """`env` with 1-D `Box` spaces and `Discrete` spaces counted from 0; `env` itself where it has them already."""
+    if type(env).__hash__ is None:
+        raise ValueError(_UNHASHABLE.format(type(env).__name__))
     given, observations, actions = env, env.observation_space, env.action_space
     if not observations.is_np_flattenable:
         raise ValueError(
@@ -143,8 +157,8 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
         raise ValueError(
             f"environment {environment_name(env)}: expected a Discrete or real Box action space, got {actions}"
         )
-    if (plain := _plain_space(observations)) is not observations:
-        env = TransformObservation(env, lambda value: to_plain(observations, value), plain)
+    if (plain := _plain_space(observations, actions)) is not observations:
+        env = TransformObservation(env, lambda value: to_plain(observations, value, actions), plain)
     if (plain := _plain_space(actions)) is not actions:
         env = TransformAction(env, lambda value: from_plain(actions, value), plain)
     if env is not given:
@@ -157,7 +171,9 @@ def as_given(env: gymnasium.Env) -> gymnasium.Env:
     return _GIVEN.get(env, env)
 
 
-def _plain_space(space: Space[Any]) -> Box | Discrete:
+def _plain_space(space: Space[Any], actions: Space[Any] | None = None) -> Box | Discrete:
+    if isinstance(space, Discrete) and isinstance(actions, Box):  # no policy is a table of continuous actions
+        return Box(0.0, 1.0, (int(space.n),), np.float64)
     if isinstance(space, Discrete):
         return space if space.start == 0 else Discrete(int(space.n))
     if isinstance(space, Box):
@@ -178,8 +194,14 @@ def check_of_space(name: str, values: np.ndarray, space: gymnasium.Space[Any]) -
         raise ValueError(f"{name}: expected entries of {space}, got {values.dtype} of shape {values.shape}")
 
 
-def to_plain(space: Any, value: Any) -> Any:
-    """An observation of `space`, flattened; `ValueError` for one whose parts are not those of the space."""
+def to_plain(space: Any, value: Any, actions: Any = None) -> Any:
+    """An observation of `space`, flattened, one-hot where it is discrete and `actions` are not.
+
+    Raises:
+      ValueError: one whose parts are not those of the space.
+    """
+    if isinstance(space, Discrete) and isinstance(actions, Box):
+        return np.eye(int(space.n))[int(value - space.start)]
     if isinstance(space, Discrete):
         return np.int64(value - space.start)
     if isinstance(space, Box):

@@ -57,12 +57,13 @@ def episodes_by_interface(
         vector.close()
 
 
-def random_episodes(env: gymnasium.Env, most: int, hold: int = 1) -> list[Rows]:
+def random_episodes(env: gymnasium.Env, most: int, hold: int = 1, *, time_limit: int | None = None) -> list[Rows]:
     """The states of a few episodes of random actions, the same at every call.
 
     Args:
       most: steps after which an episode is cut.
       hold: steps for which an action is repeated.
+      time_limit: as in `episodes_by_interface`.
 
     Raises:
       ValueError: as `episodes_by_interface`.
@@ -77,11 +78,23 @@ def random_episodes(env: gymnasium.Env, most: int, hold: int = 1) -> list[Rows]:
             held = np.stack([np.asarray(space.sample()) for _ in observations])
         return held
 
-    drawn = episodes_by_interface(env, act, seeds=0, episodes=PROBES, steps=most)
+    drawn = episodes_by_interface(env, act, seeds=0, episodes=PROBES, steps=most, time_limit=time_limit)
     return [states for states, _, _, _ in drawn]
 
 
-class _Borrowed(gymnasium.Wrapper):
+class _Silent(gymnasium.Wrapper):
+    """Without infos: nobody reads them, and copies side by side fail where theirs are of different form."""
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        """The observation alone."""
+        return self.env.reset(**arguments)[0], {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """A step without its info."""
+        return *self.env.step(action)[:4], {}
+
+
+class _Borrowed(_Silent):
     """The user's own environment, which is not closed with its copies."""
 
     def close(self) -> None:
@@ -97,6 +110,7 @@ def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None, *, one_by_on
     if (
         spec.vector_entry_point is not None
         and not (options or one_by_one)
+        and not spec.additional_wrappers
         and flattened(env.unwrapped) is env.unwrapped
     ):
         vector = gymnasium.make_vec(spec, num_envs=lanes)
@@ -104,7 +118,7 @@ def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None, *, one_by_on
         if vector.metadata.get("autoreset_mode") == AutoresetMode.NEXT_STEP:
             return vector
         vector.close()
-    wrappers: list[Any] = [flattened]
+    wrappers: list[Any] = [flattened, _Silent]
     return gymnasium.make_vec(spec, num_envs=lanes, vectorization_mode="sync", wrappers=wrappers, **options)
 
 
@@ -132,7 +146,7 @@ def _batch(
         actions.append(_within(done, act(first, t, states[-1])))
         t += 1
         with _blaming(name, f"step {t}"):
-            observations, reward, terminated, truncated, _ = vector.step(actions[-1])
+            observations, reward, terminated, truncated, _ = vector.step(actions[-1].copy())  # which it may change
         _checked(env, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
         # what idle lanes return must not reach the policy as NaN
         states.append(np.nan_to_num(_wide(seen, observations)))

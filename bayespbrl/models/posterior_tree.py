@@ -138,6 +138,17 @@ def next_lapse_rates(tree: xr.DataTree) -> Float[np.ndarray, "chain draw"]:
     return np.asarray(rates @ shares)
 
 
+def utility_margins(tree: xr.DataTree) -> Float[np.ndarray, "chain draw k"]:
+    """Draws of the margins without what an answerer adds for the side shown first."""
+    drawn, known = tree.children["posterior"].dataset, answers_of(tree)
+    margins = np.asarray(drawn["margins"].values)
+    if known.shown_first is None:
+        return margins
+    bias = drawn["side_bias"].values
+    each = bias[:, :, np.asarray(known.answerers)] if bias.ndim == 3 else bias[:, :, None]
+    return np.asarray(margins - np.asarray(known.shown_first) * each)
+
+
 def bases_of(tree: xr.DataTree) -> list[Float[np.ndarray, "d r"]]:
     """Q of each setting, of the features and, where they are known, the sides."""
     return [factors.basis for factors in _factors_of(tree)]

@@ -45,7 +45,7 @@ NOTES = {
     "adjusted for their number.",
     "calibration": "each answer was predicted before it was given. `z` below −2: overconfident, above 2: "
     "underconfident. ECE: expected calibration error, and that of calibrated predictions, by chance.",
-    "runs": "fits: posteriors over all trials and iterations. ESS: effective sample size of the worst margin. Signal, "
+    "runs": "fits: posteriors over all trials and iterations. ESS: effective sample size of what mixes worst. Signal, "
     "KL: medians over updates.",
 }  # what the columns of a table mean
 

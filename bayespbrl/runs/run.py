@@ -169,7 +169,7 @@ class Run:
             policy,
             environment.action_space,
             np.random.default_rng(),
-            observe=partial(to_plain, given.observation_space),
+            observe=partial(to_plain, given.observation_space, actions=given.action_space),
             enact=partial(from_plain, given.action_space),
             observation_shape=given.observation_space.shape,
         )
@@ -199,8 +199,8 @@ class Run:
         """Posterior draws of the last fit in ArviZ's schema; None where the estimate is no posterior."""
         return None if self.estimate is None else self.estimate.posterior
 
-    def estimate_without(self, answerer: str) -> UtilityEstimate:
-        """The utility inferred without one person's answers; the run is not changed.
+    def estimate_without(self, answerer: str | None) -> UtilityEstimate:
+        """The utility inferred without one person's answers; the run is not changed. None is who gave no name.
 
         Raises:
           ValueError: a name that nobody who answered has.

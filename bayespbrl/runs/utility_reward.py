@@ -49,7 +49,9 @@ class UtilityReward(gymnasium.Wrapper):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """A step of the environment, with the utility as the reward."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        utility, deviation = self._utility(np.asarray(to_plain(self.env.observation_space, observation))[None])
+        utility, deviation = self._utility(
+            np.asarray(to_plain(self.env.observation_space, observation, self.env.action_space))[None]
+        )
         info = info | {"true_reward": float(reward), "utility_deviation": deviation}
         return observation, utility - self.caution * deviation, terminated, truncated, info
 

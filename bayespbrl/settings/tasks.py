@@ -42,7 +42,8 @@ class Task:
     @classmethod
     def of(cls, environment: gymnasium.Env, max_steps: int | None = None) -> "Task":
         """The properties of an environment; `ValueError` where no time limit is known."""
-        horizon, measured = step_limit(environment, max_steps), partial(random_episodes, environment)
+        horizon = step_limit(environment, max_steps)
+        measured = partial(random_episodes, environment, time_limit=max_steps)
         return cls(environment.observation_space, environment.action_space, horizon, measured)
 
     def derived(self, *, people: bool) -> dict[str, Any]:

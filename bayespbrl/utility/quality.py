@@ -12,7 +12,8 @@ class FitQuality:
       converged: R̂ and effective sample size, or the linear program's status, are in order.
       status: in words.
       pairs, pairs_satisfied: K, and the number of ordered pairs with a positive margin (eq. 6).
-      rhat_max, effective_sample_size_min: the worst over the margins (NaN where there are no draws).
+      rhat_max, effective_sample_size_min: the worst of the margins and all else that is inferred (NaN where there are
+        no draws).
       log_evidence: log marginal likelihood of the answers (NaN where there is no posterior).
     """
 

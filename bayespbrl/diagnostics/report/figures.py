@@ -14,9 +14,12 @@ MAIN, ACCENT = "#1b6ca8", "#c2571a"
 
 
 def plot_value(table: xr.Dataset, axes: Axes, *, optimum: float | None = None) -> Axes:
-    """Value of each iteration's policy against the number of answers; the best one is marked."""
+    """Value of the kept policy and of the newest against the number of answers; the best one is marked."""
     answers, value = table["answers"].values, table["value"].values
     axes.plot(answers, value, marker="o", markersize=3.5, color=MAIN)
+    newest = table["value_newest"].values if "value_newest" in table else value
+    if np.any(np.isfinite(newest) & (newest != value)):
+        axes.plot(answers, newest, linewidth=0.8, color="0.55", label="newest")
     if np.isfinite(value).any():
         best = int(np.nanargmax(value))
         axes.plot(answers[best], value[best], "*", markersize=13, color=ACCENT, label=f"best: {value[best]:.4g}")
@@ -46,8 +49,8 @@ def plot_rhat(table: xr.Dataset, axes: Axes) -> Axes:
 
 
 def plot_effective_sample_size(table: xr.Dataset, axes: Axes) -> Axes:
-    """Effective sample size of the worst margin of each iteration's fit."""
-    _series(table, axes, {"effective_sample_size_min": "worst margin"}, converged="utility_converged")
+    """Effective sample size of whatever mixes worst in each iteration's fit."""
+    _series(table, axes, {"effective_sample_size_min": "the worst"}, converged="utility_converged")
     axes.axhline(SIZE_LIMIT, color="0.4", linestyle="--", linewidth=1, label=f"limit {SIZE_LIMIT:g}")
     return finished(axes, ylabel="effective sample size", ylim=(0, None))
 

@@ -46,7 +46,7 @@ def people_warnings(contents: RunContents) -> list[ReportWarning]:
     return [
         warning
         for place in range(table.sizes["answerer"])
-        for warning in _of_one(table.isel(answerer=place), several=several)
+        for warning in _of_one(table.isel(answerer=place), several=several, given=contents.model.lapse_rate is not None)
     ]
 
 
@@ -79,11 +79,14 @@ def _name(one: xr.Dataset) -> str:
     return str(one["answerer"].item()) or "no name"
 
 
-def _of_one(one: xr.Dataset, *, several: bool) -> Iterator[ReportWarning]:
-    who = str(one["answerer"].item()) or "The person without a name"
-    others = f"run.estimate_without({who!r}) infers the utility without them."
+def _of_one(one: xr.Dataset, *, several: bool, given: bool) -> Iterator[ReportWarning]:
+    name = str(one["answerer"].item()) or None
+    who = name or "The person without a name"
+    others = f"run.estimate_without({name!r}) infers the utility without them."
     rate, lower, upper = (float(one[f"lapse_rate{end}"]) for end in ("", "_lower", "_upper"))
-    if lower > LITTLE_WORTH:
+    if given:  # the answers did not decide on it
+        pass
+    elif lower > LITTLE_WORTH:
         what = f"{who}: {percent(rate)} of the answers look random ({percent(lower)} to {percent(upper)})."
         yield ReportWarning(what, f"Drop them. {others}" if several else "Start a new run with someone else.")
     elif lower > LESS_TRUST:
@@ -97,10 +100,10 @@ def _of_one(one: xr.Dataset, *, several: bool) -> Iterator[ReportWarning]:
     if low > 0 or high < 0:
         what = f"{who} favours the trajectory shown {'first' if bias > 0 else 'second'}."
         yield ReportWarning(what, "The posterior corrects for it; ask them to look at both before they answer.")
-    unsure, given = int(one["cannot_tell"]), int(one["answers"])
-    if unsure > MANY * max(FEW, unsure + given):
-        what = f"{who} could not tell in {unsure} of {count(unsure + given, 'question')}."
+    unsure, told = int(one["cannot_tell"]), int(one["answers"])
+    if unsure > MANY * max(FEW, unsure + told):
+        what = f"{who} could not tell in {unsure} of {count(unsure + told, 'question')}."
         yield ReportWarning(what, "Show longer trajectories, or explain what to look for.")
-    if float(one["seconds"]) < HASTY and given >= FEW:
+    if float(one["seconds"]) < HASTY and told >= FEW:
         what = f"{who} took {float(one['seconds']):.1f} s in the median, less than it takes to watch two trajectories."
         yield ReportWarning(what, "Ask again, and ask them to watch both.")

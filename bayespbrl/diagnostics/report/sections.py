@@ -43,9 +43,12 @@ def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
     optimum = contents.environment_attribute("optimal_return")
     panels = [("Value against answers", partial(figures.plot_value, iterations, optimum=optimum))]
     caption = (
-        "Each point is the value of the policy after an update: the mean return of fresh episodes, which the learner "
-        "never sees. Look for a rise that levels off, and for drops after it."
+        "Each point is the value of the policy that the run keeps after an update: the mean return of fresh episodes, "
+        "which the learner never sees. Look for a rise that levels off, and for drops after it."
     )
+    newest = iterations["value_newest"].values
+    if np.any(np.isfinite(newest) & (newest != iterations["value"].values)):
+        caption += " The thin line is the newest policy, where another is kept."
     if iterations_without_question(contents, iterations):
         caption += " Points above one another are iterations without a question."
     first, last = float(iterations["value"][0]), float(iterations["value"][-1])
@@ -78,7 +81,8 @@ def convergence_of_fits(contents: RunContents, iterations: xr.Dataset) -> Body:
         ("Effective sample size", partial(figures.plot_effective_sample_size, iterations)),
     ]
     caption = (
-        "The worst margin of each fit. R̂ should stay below its limit, and the effective sample size above its limit. "
+        "The worst of the margins, hyperparameters and length scales of each fit. R̂ should stay below its limit, and "
+        "the effective sample size above its limit. "
         "Crosses mark fits that did not converge within their cap of draws."
     )
     every = drawn("convergence", panels, caption, "R̂ and effective sample size by iteration.")

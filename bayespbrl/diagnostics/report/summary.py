@@ -133,6 +133,7 @@ def _undominated(contents: RunContents) -> Iterator[str]:
     size = contents.settings.rollouts.trajectories_per_iteration
     named = ", ".join(f"{n} (of iteration {n // size + 1})" for n in best)
     compared = [answer for answer in contents.answers if answer.answer is not Answer.SKIP]
-    since = max(0, sum(best[-1] in (answer.first, answer.second) for answer in compared) - 1)  # one made it the best
-    unbeaten = f" {count(since, 'comparison')} since then found nothing better." if since else ""
+    with_it = ({answer.first, answer.second} for answer in compared if best[-1] in (answer.first, answer.second))
+    since = max(0, len(set().union(*with_it)) - 2)  # itself, and the one that made it the best
+    unbeaten = f" {count(since, 'comparison')} with others since then found nothing better." if since else ""
     yield f"Undominated among all compared trajectories: number {named}.{unbeaten}"

@@ -12,11 +12,23 @@ from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary
 from bayespbrl.diagnostics.uncertainty import ranking_probabilities, return_draws
+from bayespbrl.models.posterior_tree import utility_margins
 from bayespbrl.preferences import Answer
 from bayespbrl.trajectories import Trajectory
 
 MEASURED = (
-    *("answers", "pairs", "pairs_satisfied", "value", "kl_bound", "bound_active", "kl", "kl_fitted_policy", "updates"),
+    *(
+        "answers",
+        "pairs",
+        "pairs_satisfied",
+        "value",
+        "value_newest",
+        "kl_bound",
+        "bound_active",
+        "kl",
+        "kl_fitted_policy",
+        "updates",
+    ),
     *("effective_samples", "temperature", "reps_converged", "policy_fit_converged"),
     *("entropy", "action_standard_deviation"),
     *("rhat_max", "effective_sample_size_min", "utility_converged", "log_evidence"),
@@ -64,13 +76,16 @@ def answers_table(contents: RunContents) -> xr.Dataset:
         for name in ("question", "iteration", "first", "second", "before")
     }
     data["said"] = ("answer", np.array([str(answer.answer) for answer in answers], dtype=np.str_))
-    columns = np.reshape([_by_last_estimate(contents, answer) for answer in answers], (-1, 3)).T
+    margins = None if contents.posterior is None else utility_margins(contents.posterior)
+    columns = np.reshape([_by_last_estimate(contents, answer, margins) for answer in answers], (-1, 3)).T
     for name, column in zip(("probability", "margin", "margin_sd"), columns, strict=True):
         data[name] = ("answer", column)
     return xr.Dataset(data)
 
 
-def _by_last_estimate(contents: RunContents, answer: AnsweredQuestion) -> tuple[float, float, float]:
+def _by_last_estimate(
+    contents: RunContents, answer: AnsweredQuestion, margins: np.ndarray | None
+) -> tuple[float, float, float]:
     """Probability of an answer that the estimate was fitted to, its margin and the margin's standard deviation.
 
     NaN where these are unknown: without a posterior, or where a trajectory or its features are missing.
@@ -79,15 +94,15 @@ def _by_last_estimate(contents: RunContents, answer: AnsweredQuestion) -> tuple[
     if estimate is None or answer.row is None or answer.row >= estimate.quality.pairs:
         return np.nan, np.nan, np.nan
     both = _preferred_and_dominated(contents, answer)
-    if tree is not None:
-        margins = np.asarray(tree["posterior"]["margins"])[:, :, answer.row]
+    if tree is not None and margins is not None:
+        margin = margins[:, :, answer.row]
         probability = np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row]))
     elif both is None:
         return np.nan, np.nan, np.nan
     else:
         preferred, dominated = estimate.trajectory_utilities(both)
         return np.nan, float(preferred - dominated), np.nan
-    return float(probability), float(margins.mean()), float(margins.std())
+    return float(probability), float(margin.mean()), float(margin.std())
 
 
 def prequential_table(contents: RunContents) -> xr.Dataset:

@@ -47,8 +47,13 @@ def _of_fits(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarning
         yield ReportWarning(
             f"The posterior did not converge in {_which(failed)}. {last}Uncertainties there are unreliable, and so are "
             "the policy updates that followed.",
-            "Look at the rank plots. The usual reason is answers that contradict each other, under a lapse rate that "
-            "was set to zero. Let it be inferred.",
+            "Look at the rank plots. "
+            + (
+                "The usual reason is answers that contradict each other, under the lapse rate that was set. Let it be "
+                "inferred."
+                if contents.model.lapse_rate is not None
+                else "Where they are level, it is the hyperparameters or the length scales that mix slowly."
+            ),
         )
 
 
@@ -56,7 +61,7 @@ def _of_updates(table: xr.Dataset) -> Iterator[ReportWarning]:
     iteration, failed = table["iteration"].values, table["reps_converged"].values == 0
     if failed.any():
         yield ReportWarning(
-            f"REPS did not converge in {_which(iteration[failed])}: the policy was left unchanged.",
+            f"REPS did not converge in {_which(iteration[failed])}: that update changed nothing.",
             "Fewer centres (--centres) or a smaller --kl-bound makes the dual easier to solve.",
         )
     if (idle := iteration[(table["bound_active"].values == 0) & ~failed]).size:
@@ -116,7 +121,7 @@ def _of_value(table: xr.Dataset) -> Iterator[ReportWarning]:
         yield ReportWarning(
             f"The value has fallen from {number(value[best])} (iteration {best + 1}) to {number(value[-1])}.",
             "Either the evaluation is noisy, an update was too large (look at the KL, and try a smaller --kl-bound), "
-            "or no answer covers this policy and the posterior is wrong about it: more answers help.",
+            "or no answer covers this policy, and the posterior is wrong about it: more answers help.",
         )
 
 
