@@ -65,6 +65,18 @@ def test_posterior_of_a_hundred_answers_is_that_of_quadrature(name):
     assert tree.attrs["log_evidence"] == pytest.approx(log_evidence, abs=4 * tree.attrs["log_evidence_error"] + 0.02)
 
 
+def test_answers_none_of_them_a_lapse_are_sampled_as_with_hardly_any():
+    rows = answers(66, seed=4, wrong=0.0)
+    assert len(rows) > FEW
+    none, hardly = (
+        sample_posterior(rows, lapse_rate=rate, num_samples=400, max_samples=400, seed=1)["posterior/margins"].values
+        for rate in (0.0, 1e-9)
+    )
+    error = np.hypot(*(chain_convergence(margins).monte_carlo_error for margins in (none, hardly)))
+    assert np.all(np.abs(none.mean(axis=(0, 1)) - hardly.mean(axis=(0, 1))) < 4 * error)
+    assert np.all(none.mean(axis=(0, 1)) > 0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("transport", [False, True])
 def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterior_of_quadrature(transport, monkeypatch):

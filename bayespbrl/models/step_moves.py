@@ -70,7 +70,8 @@ def step_moves(
 
     def lapse_weights(margins: Float[Array, " c"]) -> Float[Array, "a v"]:
         every = point_of(problem, unknowns)._replace(lapse_rate=problem.lapse_rate.values[:, None])
-        return problem.answerers @ log_probabilities(problem, every, margins).T + problem.lapse_rate.log_probabilities
+        log_p = jnp.atleast_2d(log_probabilities(problem, every, margins))  # one row where no answer can be a lapse
+        return problem.answerers @ log_p.T + problem.lapse_rate.log_probabilities
 
     y, margins, given_up = flight_move(
         keys[0],
