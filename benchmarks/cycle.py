@@ -174,7 +174,11 @@ def peak_memory() -> int:
 
 def main() -> None:
     """Measure, then print a table and one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        argument_default=argparse.SUPPRESS,  # the preset decides
+    )
     parser.add_argument("environment", nargs="?", default="swing-up")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--answers", type=int)

@@ -65,7 +65,11 @@ def measure(environment: str, **settings: Any) -> dict[str, Any]:
 
 def main() -> None:
     """Measure, then print one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        argument_default=argparse.SUPPRESS,  # the preset decides
+    )
     parser.add_argument("environment", nargs="?", default="swing-up")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--seed", type=int, default=0)

