@@ -189,8 +189,7 @@ class Preferences:
         if preferred not in (None, newcomer, incumbent):
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
         beside = self.undominated if rivals is None else tuple(each for each in rivals if each in self.undominated)
-        beaten = incumbent not in self.undominated and any(incumbent == worse for _, worse in self.pairs)
-        fallen = rivals is not None and (beaten or (incumbent not in beside and incumbent in rivals))
+        fallen = rivals is not None and self.has_fallen(incumbent)
         if fallen:
             beside = (incumbent,)
         elif incumbent not in beside:
@@ -208,6 +207,10 @@ class Preferences:
             new_pairs = tuple((member, newcomer) for member in beside)
         after = Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, self.sources)
         return after._with_sources(self, asked, shown_first, answerer)
+
+    def has_fallen(self, trajectory: int) -> bool:
+        """Whether it was compared, and is undominated no longer."""
+        return trajectory not in self.undominated and any(trajectory == worse for _, worse in self.pairs)
 
     def tied_with(self, trajectory: int) -> tuple[int, ...]:
         """The undominated trajectories that tie with one of them, itself among them, in their order.
@@ -332,12 +335,11 @@ def opponent_now(
 
     One that another question of the iteration has beaten gives way to who is undominated from its start by then.
     """
-    standing = preferences.undominated
-    opponent = opponents[newcomer] if opponents else standing[-1]
-    if opponent in standing or all(opponent != worse for _, worse in preferences.pairs):
+    opponent = opponents[newcomer] if opponents else preferences.undominated[-1]
+    if not preferences.has_fallen(opponent):
         return opponent
     group = next(group for group in same_starts(trajectories) if opponent in group)
-    return next((each for each in reversed(standing) if each in group and each != newcomer), opponent)
+    return next((each for each in reversed(preferences.undominated) if each in group and each != newcomer), opponent)
 
 
 def rivals(query: Query, trajectories: Sequence[Trajectory], preferences: Preferences) -> list[int]:

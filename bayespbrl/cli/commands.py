@@ -2,8 +2,9 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -104,20 +105,23 @@ RUN_OPTIONS = {
 
 
 def _takes_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """`command` with a parameter for each of `RUN_OPTIONS`, of the type that its part of the settings has."""
+    """`command` with a parameter for each of `RUN_OPTIONS`, of the type that its part of the settings has.
+
+    It gets those that are on the command line.
+    """
     env, *named = (p for p in inspect.signature(command).parameters.values() if p.kind is not p.VAR_KEYWORD)
     options = []
     for name, text in RUN_OPTIONS.items():
         kind = get_type_hints(PARTS.get(OPTIONS[name], Settings))[name] | None
         given = {"default": None, "annotation": Annotated[kind, typer.Option(help=text)]}
         options.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, **given))
-    vars(command)["__signature__"] = inspect.Signature([env, *options, *named])
-    return command
 
+    @wraps(command)
+    def with_given(**values: Any) -> None:
+        command(**{name: value for name, value in values.items() if value is not None or name not in RUN_OPTIONS})
 
-def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that are on the command line."""
-    return {name: value for name, value in options.items() if value is not None}
+    vars(with_given)["__signature__"] = inspect.Signature([env, *options, *named])
+    return with_given
 
 
 @app.command()
@@ -140,7 +144,7 @@ def run(
                 f"{name}: expected --no-{name} only with the expert page, got the expert {expert or 'return'}"
             )
     directory = out or fresh_directory(env)
-    learner = runs.start(env, directory, seed=seed, **_given(options))
+    learner = runs.start(env, directory, seed=seed, **options)
     with continuing(directory):
         place = Place(browser=browser)
         run_to_the_end(learner, directory, answerers=answerer or [], practice=practice, place=place)
@@ -218,8 +222,8 @@ def trials(
     with progress_bar() as bar:
         task = bar.add_task("trials", total=number, state=f"{directory}")
         try:
-            seeds, given = range(seed, seed + number), _given(options)
-            study = run_trials(env, directory, seeds=seeds, jobs=jobs, progress=lambda _: bar.advance(task), **given)
+            seeds = range(seed, seed + number)
+            study = run_trials(env, directory, seeds=seeds, jobs=jobs, progress=lambda _: bar.advance(task), **options)
         except KeyboardInterrupt:
             console.print("Stopped. Nothing is lost: repeat the command to continue.")
             raise

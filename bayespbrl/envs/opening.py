@@ -21,9 +21,6 @@ AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
 
 # Environments that we made from an id, and that can therefore be made again, N at a time.
 _MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
-_UNHASHABLE = (
-    "environment {}: expected a class with a hash, got one that compares by value; @dataclass(eq=False) does not"
-)
 # What `flattened` wrapped.
 _GIVEN: WeakKeyDictionary[gymnasium.Env, gymnasium.Env] = WeakKeyDictionary()
 
@@ -54,9 +51,12 @@ def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
         opened = flattened(_make(spec))
         _MADE_FROM[opened] = spec
         return opened
+    if isinstance(environment, gymnasium.Env | FuncEnv) and type(environment).__hash__ is None:
+        raise ValueError(
+            f"environment {type(environment).__name__}: expected a class with a hash, got one that compares by value; "
+            "@dataclass(eq=False) does not"
+        )
     if isinstance(environment, FuncEnv):
-        if type(environment).__hash__ is None:
-            raise ValueError(_UNHASHABLE.format(type(environment).__name__))
         return flattened(FunctionalEnv(environment))
     if isinstance(environment, gymnasium.Env):
         return flattened(environment)
@@ -146,8 +146,6 @@ def _one_line(value: object) -> str:
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
     """`env` with 1-D `Box` spaces and `Discrete` spaces counted from 0; `env` itself where it has them already."""
-    if type(env).__hash__ is None:
-        raise ValueError(_UNHASHABLE.format(type(env).__name__))
     given, observations, actions = env, env.observation_space, env.action_space
     if not observations.is_np_flattenable:
         raise ValueError(

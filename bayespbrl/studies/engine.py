@@ -97,12 +97,8 @@ class Engine:
         new = [
             (seed - row.row.settings.seed, place, seed) for place, row in enumerate(self.rows) for seed in row.to_do()
         ]
-        given_up = [failure.row for failure in self.failures]
-        self.failures += [
-            Failure(row.row, row.row.settings.seed, row.exhausted)
-            for row in self.rows
-            if row.exhausted and row.row not in given_up
-        ]
+        given_up = [Failure(row.row, row.row.settings.seed, row.exhausted) for row in self.rows if row.exhausted]
+        self.failures += [failure for failure in given_up if failure not in self.failures]
         for _, place, seed in sorted(new):
             if (place, seed) not in self._starts:
                 self._submit(place, seed)
