@@ -101,7 +101,7 @@ class Learner:
         self.log: Log | None = None
         self.own_policy = own_policy
         first = self.first_policy()
-        self.state = events.replay(LearnerState(first, first), entries)
+        self.state = events.replay(LearnerState(first, first, first), entries)
 
     def logged(self, log: Log) -> "Learner":
         """The same learner, with each further event appended to `log`."""

@@ -160,7 +160,7 @@ def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
 
 
 def test_nobody_has_answered_a_new_run_and_an_answer_without_a_name_is_somebodys():
-    assert LearnerState("policy").preferences.answerers == ()
+    assert LearnerState(*["policy"] * 3).preferences.answerers == ()
     assert Preferences(answers=1).answerers == (None,)
 
 

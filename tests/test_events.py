@@ -41,7 +41,7 @@ def improved(iteration):
 
 
 UNDONE = Entry({"event": "undone"})
-START = LearnerState("policy 0")
+START = LearnerState(*["policy 0"] * 3)
 # Two iterations by hand: 2 beats 0; 1 is worse than 2; then 4 ties with 2.
 HISTORY = (
     collected(1, [0, 2, 1], wanted=2),
@@ -120,8 +120,7 @@ def test_the_fold_changes_nothing_that_it_is_given():
 def test_a_policy_is_started_anew_once_and_what_was_kept_is_remembered():
     anew = collected(3, [5], seed=2)
     anew = dataclasses.replace(anew, event={**anew.event, "restarted": True})
-    begun = dataclasses.replace(START, first_policy="policy 0")
-    state = replay(begun, (*HISTORY, anew))
+    state = replay(START, (*HISTORY, anew))
     assert (state.policy, state.started, state.best, state.tried, state.trust) == ("policy 0", 2, 2, (), 1.0)
     assert (state.kept, state.kept_policy, state.restart) == (2, "policy 2", Restart(2, 2, "policy 2", ()))
     checked = {"check": {"best": 2, "trust": 1.0}}
@@ -131,7 +130,7 @@ def test_a_policy_is_started_anew_once_and_what_was_kept_is_remembered():
         assert apply(state, update).kept_policy == policy
     for history in ((anew,), (*HISTORY, anew, improved(3), anew)):
         with pytest.raises(ValueError, match="collected: expected at most one restart"):
-            replay(begun, history)
+            replay(START, history)
 
 
 @pytest.mark.parametrize("length", range(3, len(HISTORY) + 1))

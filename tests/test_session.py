@@ -39,6 +39,7 @@ from bayespbrl.runs.lock import continuing
 from bayespbrl.trajectories import Trajectory
 
 WAIT = 120  # seconds at most
+NO_POLICIES = [None] * 3
 
 
 @pytest.fixture
@@ -137,7 +138,7 @@ class Known:
 )
 def test_what_is_said_of_a_question_is_how_sure_the_answer_is_and_what_it_is_worth(draws, sure, worth, likely):
     query = Query(1, 0, 1, 1, (None, None))
-    said, order = said_of(query, LearnerState(None, estimate=Known(*draws)))
+    said, order = said_of(query, LearnerState(*NO_POLICIES, estimate=Known(*draws)))
     np.testing.assert_allclose([said["sure"], said["worth"]], [sure, worth], atol=1e-4)
     assert order[0] == likely
     stop = "That is less than 0.01 bit: further answers change little, and you can stop here."
@@ -145,12 +146,12 @@ def test_what_is_said_of_a_question_is_how_sure_the_answer_is_and_what_it_is_wor
 
 
 def test_a_person_may_stop_from_the_least_worth_on_and_not_before(monkeypatch):
-    query, state = Query(1, 0, 1, 1, (None, None)), LearnerState(None, estimate=Known((1.0, 0.0), (0.9, 0.0)))
+    query, state = Query(1, 0, 1, 1, (None, None)), LearnerState(*NO_POLICIES, estimate=Known((1.0, 0.0), (0.9, 0.0)))
     worth = said_of(query, state)[0]["worth"]
     for little, stops in ((worth * 1.001, True), (worth * 0.999, False)):
         monkeypatch.setattr("bayespbrl.people.views.LITTLE", little)
         assert ("you can stop here" in said_of(query, state)[0]["advice"]) == stops
-    assert said_of(query, LearnerState(None))[0] == {"worth": None, "sure": None, "advice": ""}
+    assert said_of(query, LearnerState(*NO_POLICIES))[0] == {"worth": None, "sure": None, "advice": ""}
 
 
 @pytest.mark.parametrize(
@@ -292,7 +293,7 @@ def test_practice_questions_are_about_other_trajectories_where_there_are_enough(
     def asked(number, first, second):
         both = (trajectories[first], trajectories[second])
         state = LearnerState(
-            None, trajectories=tuple(trajectories[:number]), open=(Query(1, first, second, second, both),)
+            *NO_POLICIES, trajectories=tuple(trajectories[:number]), open=(Query(1, first, second, second, both),)
         )
         return [(query.first, query.second) for query in practice_queries(state)]
 

@@ -18,8 +18,8 @@ from test_cli import call, refused
 from test_trials import ThisProcess, without_processes
 
 import bayespbrl
-from bayespbrl import runs
 from bayespbrl.results.study_data import read_study
+from bayespbrl.runs import run as runs
 from bayespbrl.studies import Study, declared, rows
 from bayespbrl.studies.cluster import scheduler_executor
 from bayespbrl.studies.declaration import parsed, shipped

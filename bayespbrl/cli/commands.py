@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from bayespbrl import checks, runs
+from bayespbrl import checks
 from bayespbrl.cli.compiled import keep_compiled
 from bayespbrl.cli.display import (
     PICTURE,
@@ -26,6 +26,7 @@ from bayespbrl.cli.opening import Place
 from bayespbrl.cli.studies import run_study, show_plan
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.experts import SIMULATED
+from bayespbrl.runs import run as runs
 from bayespbrl.runs.directory import fresh_directory
 from bayespbrl.runs.lock import continuing
 from bayespbrl.settings import OPTIONS, PARTS, Settings

@@ -113,7 +113,7 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
             state,
             policy=state.first_policy,
             best=state.iteration,
-            best_policy=None,
+            best_policy=state.first_policy,
             tried=(),
             best_tried=(),
             trust=1.0,

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from bayespbrl.improvement.schedules import Bound
+from bayespbrl.policies import Policy
 from bayespbrl.preferences import PastQuestion, Preferences, Query
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory, clips_of
@@ -22,7 +23,7 @@ class Restart:
 
     iteration: int
     number: int
-    policy: Any
+    policy: Policy
     tried: tuple[Trajectory, ...]
 
 
@@ -33,8 +34,8 @@ class LearnerState:
     Attributes:
       policy: the newest policy, which the next trajectories follow unless the policy is started anew.
       first_policy: the one that a policy started anew begins with.
-      best_policy: where updates are checked, the one that the posterior thinks best of the policies before the newest;
-        the next update starts there after a step back.
+      best_policy: where updates are checked, the one that the posterior thinks best of the policies before the newest,
+        the first before the second update; the next update starts there after a step back.
       best: the number of the best policy, that is of the iterations before it; since a restart, where there was one.
       kept: the number of the policy that the run keeps: the best or, if the posterior prefers it, the newest; after a
         restart that kept before it, unless one of these is clearly better.
@@ -64,9 +65,9 @@ class LearnerState:
       before: the states before the last answers, at most `MOST_UNDONE`, the newest last; they have none themselves.
     """
 
-    policy: Any
-    first_policy: Any = None
-    best_policy: Any = None
+    policy: Policy
+    first_policy: Policy
+    best_policy: Policy
     best: int = 0
     kept: int = 0
     tried: tuple[Trajectory, ...] = ()
@@ -132,7 +133,7 @@ class LearnerState:
         return clips_of(self.trajectories, self.clips or None)
 
     @property
-    def kept_policy(self) -> Any:
+    def kept_policy(self) -> Policy:
         """The policy number `kept`."""
         if self.restart is not None and self.kept == self.restart.number:
             return self.restart.policy

@@ -1,5 +1,8 @@
-"""A run that is kept on disk."""
+"""A run on disk, and back.
 
-from bayespbrl.runs.run import Run, load, resume, start
-
-__all__ = ["Run", "load", "resume", "start"]
+run                      start it, resume it, load it; utility_reward: its utility as the reward of another learner
+directory, files         what is written where, and how; iteration_files, stored_classes: arrays, and classes by name
+lock                     one process continues it at a time
+answers_file, film       answers and episodes for other programs
+simulated                who answers a run that needs nobody
+"""

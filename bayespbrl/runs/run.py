@@ -227,6 +227,6 @@ class Run:
 
     def report(self, format: str = "html") -> Path:
         """Write the diagnostic report, `report.html` or `report.md`, into the run directory and return its path."""
-        from bayespbrl.diagnostics.report import write_report  # here, since the report imports this module
+        from bayespbrl.diagnostics.report import write_report  # here, since few runs need matplotlib's time
 
         return write_report(self.path, format=format, env=self.learner.environment, features=self.learner.features)

@@ -8,10 +8,11 @@ from typing import Any
 
 import xarray as xr
 
-from bayespbrl import checks, runs
+from bayespbrl import checks
 from bayespbrl.envs.opening import environment_name, open_environment
 from bayespbrl.experts import SIMULATED
 from bayespbrl.learner import Learner
+from bayespbrl.runs import run as runs
 from bayespbrl.runs.directory import RunDirectory, read_summary
 from bayespbrl.runs.simulated import expert_of
 from bayespbrl.settings import Settings, Task, settings_for

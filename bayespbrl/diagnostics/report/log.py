@@ -7,11 +7,12 @@ says why.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from bayespbrl import events
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.events import Entry, LearnerState
+from bayespbrl.policies import Policy
 from bayespbrl.preferences import Answer
 from bayespbrl.runs.directory import PartialLine, read_log_lines, read_summary
 from bayespbrl.settings import Settings
@@ -112,8 +113,9 @@ def _applied(
     log: Sequence[Event], settings: Settings, damage: list[ReportWarning]
 ) -> tuple[LearnerState, list[AnsweredQuestion]]:
     """The learner's state without its heavy parts, and the answers."""
-    state, answers = LearnerState(None), []
     # stand-ins: applying an event only needs the heavy parts to be there
+    none = cast(Policy, None)
+    state, answers = LearnerState(none, none, none), []
     parts = {"trajectories": [None] * settings.rollouts.trajectories_per_iteration, "policy": None, "estimate": None}
     clips: list[tuple[int, int]] = []
     for event in log:
