@@ -133,6 +133,11 @@ def pairs(name: str, values: Any) -> np.ndarray:
     return array.astype(np.int64)
 
 
+def in_one_line(error: Exception) -> str:
+    """What an error says, without line breaks; its type where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def _shortened(values: Any) -> str:
     text = " ".join(repr(values).split())
     return text if len(text) <= 60 else text[:60] + "…"

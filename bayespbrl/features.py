@@ -47,7 +47,7 @@ class RadialBasis:
     """φ_d(s) = exp(−½ Σⱼ δⱼ²/bⱼ²) around centre d; δⱼ a difference, or a chord where dimension j is periodic.
 
     Attributes:
-      bandwidths: b in the units of the observation; a dimension of bandwidth zero is left out.
+      centres, bandwidths: D centres, and b, in the units of the observation; a dimension with b = 0 is left out.
       period: infinite where not periodic.
       normalised: whether φ is divided by its sum. A linear function of it then keeps the value of the nearest centres
         beyond them, where plain radial basis functions fall to zero.

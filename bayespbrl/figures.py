@@ -1,16 +1,23 @@
 """Figures without matplotlib's global state, which is imported where one is drawn; what is shown of many pictures."""
 
 import io
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Int, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import LayoutEngine
 
 
-def new_figure(width: float, height: float, *, layout: Any = "constrained", dpi: float | None = None) -> "Figure":
+def new_figure(
+    width: float,
+    height: float,
+    *,
+    layout: "Literal['constrained'] | LayoutEngine | None" = "constrained",
+    dpi: float | None = None,
+) -> "Figure":
     """An empty figure, inches; the options are matplotlib's."""
     from matplotlib.figure import Figure
 

@@ -38,7 +38,7 @@ class Query:
     Attributes:
       number: of the question in its run, from 1.
       first, second: numbers of the two trajectories in the order shown, which is drawn at random.
-      newcomer: number of the new one; the other is the newest undominated trajectory.
+      newcomer: number of the new one; the other is its opponent.
       trajectories: the two trajectories, in the order shown.
       repeats: number of the earlier question about the same two, which were then shown the other way round; None for a
         new question.
@@ -125,19 +125,6 @@ class Preferences:
     sources: tuple[Source, ...] = ()
 
     @property
-    def shown_first(self) -> tuple[tuple[tuple[int, int], int], ...]:
-        """The pairs and ties that were asked about, each with the side of its `Source`.
-
-        What follows from an answer for other rivals was shown to nobody.
-        """
-        return tuple((self._pair(source), source.side) for source in self.sources if source.side)
-
-    @property
-    def answered_by(self) -> tuple[tuple[tuple[int, int], str], ...]:
-        """The pairs and ties with a known answerer, each with the answerer's name."""
-        return tuple((self._pair(each), each.answerer) for each in self.sources if each.answerer is not None)
-
-    @property
     def answerers(self) -> tuple[str | None, ...]:
         """All who answered, each once, in the order of their first answers; None stands for those without a name."""
         return tuple(dict.fromkeys(source.answerer for source in self.sources)) or (None,) * bool(self.answers)
@@ -148,9 +135,6 @@ class Preferences:
         keys = [(False, number) for number in range(len(self.pairs))]
         keys += [(True, number) for number in range(len(self.ties))]
         return [known.get(key, Source(*key, 0, None)) for key in keys]
-
-    def _pair(self, source: Source) -> tuple[int, int]:
-        return (self.ties if source.tied else self.pairs)[source.number]
 
     def start(self, trajectory: int) -> "Preferences":
         """The same preferences with `trajectory` as the first undominated one."""
@@ -271,10 +255,6 @@ class Preferences:
             for number in range(first, len(every))
         ]
         return replace(self, sources=(*self.sources, *new))
-
-    def differences(self, trajectory_features: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
-        """ψ(preferred) − ψ(dominated) for each pair (eq. 5), from ψ of all trajectories."""
-        return pair_differences(self.pairs, trajectory_features)
 
 
 def side_of(pair: tuple[int, int], shown_first: int) -> int:

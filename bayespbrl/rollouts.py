@@ -141,7 +141,7 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
     env = open_environment(environment)
     if max_steps is not None:
         return whole("max_steps", max_steps)
-    limits: list[Any] = [layer._max_episode_steps for layer in _layers(env) if isinstance(layer, TimeLimit)]
+    limits: list[int | None] = [layer._max_episode_steps for layer in _layers(env) if isinstance(layer, TimeLimit)]
     limits.append(env.spec.max_episode_steps if env.spec is not None else None)
     limits.append(environment_attribute(env, "max_episode_steps"))
     for limit in limits:

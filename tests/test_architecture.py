@@ -168,9 +168,9 @@ def test_the_rule_refuses_what_it_should():
     assert floor_of("diagnostics.plots") == "diagnostics"
     assert floor_of("envs.gridworld") == "environments"
     assert floor_of("environment") is None
-    assert not permitted("utility.averaging", "improvement.reps")
+    assert not permitted("utility.inference", "improvement.reps")
     assert not permitted("models.posterior", "utility.estimate")
-    assert permitted("learner", "utility.averaging")
+    assert permitted("learner", "utility.inference")
     assert {"policies", "improvement.q_function", "improvement.reps"} <= ours("improvement.update")
 
 

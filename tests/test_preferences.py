@@ -55,12 +55,17 @@ def test_a_beaten_opponent_gives_way_to_who_stands_for_its_start():
 
 
 def test_the_side_is_known_of_what_was_asked_and_of_nothing_that_follows():
+    def sides(preferences):
+        """Of the pairs, then of the ties, that were asked about."""
+        both = (*preferences.pairs, *preferences.ties)
+        return [(pair, row.side) for pair, row in zip(both, preferences.rows(), strict=True) if row.side]
+
     before = Preferences(undominated=(0, 2), answers=2)
-    assert before.add(7, 2, preferred=7, shown_first=7).shown_first == (((7, 2), 1),)
-    assert before.add(7, 2, preferred=7, shown_first=2).shown_first == (((7, 2), -1),)
-    assert before.add(7, 2, preferred=2, shown_first=7).shown_first == (((2, 7), -1),)
+    assert sides(before.add(7, 2, preferred=7, shown_first=7)) == [((7, 2), 1)]
+    assert sides(before.add(7, 2, preferred=7, shown_first=2)) == [((7, 2), -1)]
+    assert sides(before.add(7, 2, preferred=2, shown_first=7)) == [((2, 7), -1)]
     both = before.add(7, 2, preferred=None, shown_first=2).add(8, 7, preferred=8, shown_first=8)
-    assert both.shown_first == (((7, 2), -1), ((8, 7), 1))
+    assert sides(both) == [((8, 7), 1), ((7, 2), -1)]
 
 
 def test_five_answers_by_hand():
@@ -84,13 +89,13 @@ def test_a_comparison_with_another_than_the_newest_undominated_one_is_refused(in
 
 def test_differences_are_preferred_minus_dominated():
     features = np.array([[1.0, 2.0, 4.0], [0.5, -1.0, 3.0], [7.0, 0.0, 1.0]])
-    differences = Preferences(pairs=((0, 1), (2, 0))).differences(features)
+    differences = pair_differences(((0, 1), (2, 0)), features)
     np.testing.assert_array_equal(differences, [[0.5, 3.0, 1.0], [6.0, -2.0, -3.0]])
 
 
 def test_differences_of_no_pair_and_of_one_are_matrices():
     features = np.arange(12.0).reshape(4, 3)
-    assert Preferences().differences(features).shape == (0, 3)
+    assert pair_differences((), features).shape == (0, 3)
     np.testing.assert_array_equal(pair_differences([(3, 1)], features), [[6.0, 6.0, 6.0]])
 
 

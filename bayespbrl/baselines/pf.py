@@ -31,10 +31,9 @@ from bayespbrl.baselines.steps import Step
 from bayespbrl.experts import Expert
 from bayespbrl.policies import TabularPolicy
 from bayespbrl.preferences import Answer, parse_answer
-from bayespbrl.trajectories import Trajectory
+from bayespbrl.trajectories import DISCOUNT, Trajectory
 
 ERROR_WIDTH = 0.25  # M, in units of w
-DISCOUNT = 0.98  # of the planner; the paper's for all its methods
 DRAWS, MOVES = 300, 40  # of the posterior, and elliptical slices between two answers
 
 

@@ -26,12 +26,18 @@ from bayespbrl.cli.opening import Place
 from bayespbrl.cli.studies import run_study, show_plan
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.experts import SIMULATED
+from bayespbrl.improvement.schedules import SCHEDULES
+from bayespbrl.models.likelihoods import LIKELIHOODS
+from bayespbrl.policies.choice import POLICIES
+from bayespbrl.queries import QUERY_RULES
 from bayespbrl.runs import run as runs
 from bayespbrl.runs.directory import fresh_directory
 from bayespbrl.runs.lock import continuing
 from bayespbrl.settings import OPTIONS, PARTS, Settings
+from bayespbrl.settings.presets import DEFAULT
 from bayespbrl.studies import Study, declared, run_trials
 from bayespbrl.studies.cluster import scheduler_executor
+from bayespbrl.utility.inference import METHODS
 
 app = typer.Typer(
     help="Preference-based reinforcement learning: a policy from answers to 'which of these two is better?'.",
@@ -68,12 +74,12 @@ Env = Annotated[str, typer.Argument(help=f"{', '.join(SHORT_NAMES)}, or any gymn
 RUN_OPTIONS = {
     "answers": "Budget: maximum number of answers, ties included (default 20); the iterations follow from it.",
     "preset": "default (for any task) or paper (the paper's protocol, with its constant KL bound).",
-    "utility": "Estimate of the utility: posterior-mean, most-likely, posterior-draw, linear-program, or known-reward "
-    "(a reference run trained on the hidden reward).",
-    "query": "Rule that selects the trajectories to ask about: information-when-unsure (default), highest-utility (the "
-    "paper's), probably-better, thompson, information, disagreement or eubo (expected utility of the best option).",
-    "schedule": "KL bound of each update: confidence (default), which scales it with the confidence that the update is "
-    "an improvement, or constant (the paper's).",
+    "utility": f"Estimate of the utility: {', '.join(METHODS)}. The last is a reference run trained on the hidden "
+    "reward.",
+    "query": f"Rule that selects the trajectories to ask about: {', '.join(QUERY_RULES)}. The default is "
+    f"{DEFAULT['query']}, the paper's highest-utility.",
+    "schedule": f"KL bound of each update: {' or '.join(SCHEDULES)}. The default, {DEFAULT['schedule']}, scales it "
+    "with the confidence that the update is an improvement; the paper's is constant.",
     "hyperparameters": "Length scales, steepness and lapse rate: inferred (part of the posterior, unless --steepness "
     "or --lapse-rate sets one) or given (as set, or the paper's).",
     "iterations": "Maximum number of cycles of the four steps; by default they follow from the answers.",
@@ -84,7 +90,7 @@ RUN_OPTIONS = {
     "same_start": "Compare two trajectories from the same start, where resets of the environment by seed allow it.",
     "unasked_iterations": "Maximum number of consecutive iterations without a question (at most half the answers so "
     "far); with the schedule confidence, only while its confidence is high. 0 in the paper and for people.",
-    "likelihood": "Likelihood of an answer: mixed (eq. 8), logistic or probit.",
+    "likelihood": f"Likelihood of an answer: {', '.join(LIKELIHOODS)}. The default, mixed, is eq. 8.",
     "prior_scale": "Prior standard deviation of each utility weight.",
     "steepness": "Steepness of the likelihood, for feature differences of root mean square length 1; inferred if "
     "omitted, or 5 with --hyperparameters given.",
@@ -94,7 +100,7 @@ RUN_OPTIONS = {
     "trajectory_discount": "Discount of the trajectory features, in [0, 1]: 1 by default, because experts judge whole "
     "trajectories; the paper's is the discount of Q.",
     "wrong_answers": "Share of the simulated expert's answers that are reversed, in [0, 1].",
-    "policy": "Kind of policy: auto, tabular, softmax, linear-gaussian or gaussian-process.",
+    "policy": f"Kind of policy: auto, {', '.join(POLICIES)}.",
     "centres": "Number of radial basis functions of each kind of feature.",
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
     "repeats": "Share of the questions that repeat an earlier one with sides swapped, to measure how consistent a "

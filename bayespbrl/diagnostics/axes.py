@@ -1,12 +1,10 @@
 """Helpers of the figures: labels, whole numbers along the x axis, a legend, numbered cells."""
 
-from typing import Any
-
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 
-def finished(axes: Axes, *, whole: bool = True, **labels: Any) -> Axes:
+def finished(axes: Axes, *, whole: bool = True, **labels: object) -> Axes:
     """`axes` with `labels` set, whole numbers along x if `whole`, and a legend if anything drawn has a name."""
     axes.set(**labels)
     if whole:

@@ -10,6 +10,7 @@ import xarray as xr
 from jaxtyping import Float, Int
 
 from bayespbrl import checks
+from bayespbrl.diagnostics.predictions import tied_rows
 from bayespbrl.models.likelihoods import likelihood_of, prob
 from bayespbrl.models.posterior_tree import answers_of, number_of_preferences, settings_of
 from bayespbrl.utility.posterior_utility import spacing
@@ -42,8 +43,7 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
     number = tree.children["constant_data"].sizes["preference"]
     every = slice(None, None, spacing(drawn["setting"].size, checks.whole("draws", draws)))
     margins = drawn["margins"].values.reshape(drawn["setting"].size, number)[every]
-    tied = np.asarray(tree.children["observed_data"]["answers"]) == 0
-    given = np.where(tied, 0, 1)[None]
+    given = np.where(tied_rows(tree), 0, 1)[None]
     simulated = _simulated(tree, margins, every, np.random.default_rng(seed))
     triads = _triads(settings_of(tree.children["constant_data"].dataset["differences"].values)[0])
     counts: dict[str, tuple[np.ndarray, np.ndarray, int]] = {

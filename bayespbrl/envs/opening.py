@@ -192,7 +192,9 @@ def check_of_space(name: str, values: np.ndarray, space: gymnasium.Space[Any]) -
         raise ValueError(f"{name}: expected entries of {space}, got {values.dtype} of shape {values.shape}")
 
 
-def to_plain(space: Any, value: Any, actions: Any = None) -> Any:
+def to_plain(
+    space: gymnasium.Space[Any], value: Any, actions: gymnasium.Space[Any] | None = None
+) -> np.ndarray | np.int64:
     """An observation of `space`, flattened, one-hot where it is discrete and `actions` are not.
 
     Raises:
@@ -210,6 +212,6 @@ def to_plain(space: Any, value: Any, actions: Any = None) -> Any:
         raise ValueError(f"observation: expected one of {space}, got {_one_line(value)}") from error
 
 
-def from_plain(space: Any, value: Any) -> Any:
+def from_plain(space: Any, value: Any) -> np.ndarray | np.int64:
     """An action of `space`, from a flattened one."""
     return np.reshape(value, space.shape) if isinstance(space, Box) else np.int64(value + space.start)

@@ -7,7 +7,7 @@ observations are drawn against time. No hidden reward is shown.
 import os
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MAX_FRAMES = 100
 
 
-def draw_trajectory(environment: Any, trajectory: Drawn, axes: "Axes") -> "Axes":
+def draw_trajectory(environment: AnyEnvironment, trajectory: Drawn, axes: "Axes") -> "Axes":
     """Draw a whole trajectory on matplotlib `axes`, and return them.
 
     Args:

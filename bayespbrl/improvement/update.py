@@ -46,6 +46,7 @@ class ProposedUpdate:
       base_weights: Wᵢ, shape (N,).
       q_draws: Qᵢ under each of S posterior draws of the utility, shape (N, S); None without a posterior.
       q_halves: Qᵢ by either half of the data, for each of m divisions into halves; None where it was not asked for.
+      solved: the solutions so far, by their bounds.
     """
 
     policy: Policy

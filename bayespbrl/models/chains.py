@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax, random
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 from scipy.special import softmax
 
 from bayespbrl.models.elliptical_slice import Ellipse, independent_move
-from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords, Values
+from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords, SiteValues
 from bayespbrl.models.gaussian_fit import GaussianFit
 from bayespbrl.models.gibbs import (
     FEW,
@@ -62,7 +62,7 @@ CHUNK = 25
 
 
 Recorded = tuple[EllipticalSliceState, Unknowns, Float[Array, "*draws k"]]
-Drawn = tuple[tuple[EllipticalSliceState, Unknowns], Recorded]
+Chunk = tuple[tuple[EllipticalSliceState, Unknowns], Recorded]
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class Chains:
             draws.append(part | {name: np.asarray(value) for name, value in them._asdict().items()})
         return replace(self, state=state, unknowns=unknowns, draws=tuple(draws))
 
-    def _next_chunk(self, state: EllipticalSliceState, unknowns: Unknowns, *, compiled: bool) -> Drawn:
+    def _next_chunk(self, state: EllipticalSliceState, unknowns: Unknowns, *, compiled: bool) -> Chunk:
         if self.steps is None:
             return draw_chunk(state, unknowns, self.problem, length=self.chunk)
         # several threads would each compile
@@ -244,7 +244,7 @@ def _ellipses(model_args: Args, model_kwargs: Keywords, *, sweeps: int = 1) -> l
     ]
 
 
-def _log_likelihood(z: Values, model_args: Args, model_kwargs: Keywords) -> Float[Array, ""]:
+def _log_likelihood(z: SiteValues, model_args: Args, model_kwargs: Keywords) -> Float[Array, ""]:
     (problem,) = model_args
     return total_log_prob(problem.likelihood, problem.loadings @ z["utility_weights"], problem.used)
 
@@ -265,7 +265,7 @@ def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem)
 
     def sweep(
         last: tuple[EllipticalSliceState, Unknowns], _: None
-    ) -> tuple[tuple[EllipticalSliceState, Unknowns], tuple[Array, Array]]:
+    ) -> tuple[tuple[EllipticalSliceState, Unknowns], tuple[Float[Array, ""], Bool[Array, ""]]]:
         state, unknowns = last
         key, key_unknowns, key_weights = random.split(state.rng_key, 3)
         z, unknowns = moved(key_unknowns, state.z["utility_weights"], unknowns, problem)
@@ -299,11 +299,11 @@ def flight_draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointP
 @partial(jax.jit, static_argnames="length", compiler_options={"xla_backend_optimization_level": 1})
 def draw_chunk(
     state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem, steps: Steps | None = None, *, length: int
-) -> Drawn:
+) -> Chunk:
     """`length` draws of all chains, with `steps` of one: the last, and all, with log p of each answer at each."""
 
-    def chain(state: EllipticalSliceState, unknowns: Unknowns) -> Drawn:
-        def step(last: tuple[EllipticalSliceState, Unknowns], _: None) -> Drawn:
+    def chain(state: EllipticalSliceState, unknowns: Unknowns) -> Chunk:
+        def step(last: tuple[EllipticalSliceState, Unknowns], _: None) -> Chunk:
             drawn = draw(*last, problem) if steps is None else flight_draw(*last, problem, steps)
             state, unknowns, answers = drawn
             return (state, unknowns), (state._replace(rng_key=jnp.zeros(())), unknowns, answers)
@@ -323,17 +323,17 @@ def flight_chunk(
     *,
     length: int,
     at_once: bool,
-) -> Drawn:
+) -> Chunk:
     """As `draw_chunk`, each chain by itself, so that none waits for a longer flight; `at_once` in several threads."""
 
-    def one(number: int) -> Drawn:
+    def one(number: int) -> Chunk:
         with jax.enable_x64(True):  # a setting of the thread
             start = jax.tree.map(lambda all_chains: all_chains[number], (state, unknowns))
-            drawn: Drawn = draw_chunk(*start, problem, steps, length=length)
+            drawn: Chunk = draw_chunk(*start, problem, steps, length=length)
             drawn[1][2].block_until_ready()
             return drawn
 
     numbers = range(len(unknowns.setting))
     with ThreadPoolExecutor(len(numbers) if at_once else 1) as pool:
-        chains: Drawn = jax.tree.map(lambda *each: jnp.stack(each), *pool.map(one, numbers))
+        chains: Chunk = jax.tree.map(lambda *each: jnp.stack(each), *pool.map(one, numbers))
     return chains

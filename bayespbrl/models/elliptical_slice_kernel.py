@@ -23,7 +23,7 @@ from bayespbrl import checks
 from bayespbrl.models.elliptical_slice import Ellipse, elliptical_moves
 
 GAUSSIANS = (dist.Normal, dist.MultivariateNormal, dist.LowRankMultivariateNormal, dist.GaussianRandomWalk)
-Values = dict[str, Array]  # of the latent sites, by their names
+SiteValues = dict[str, Array]  # of the latent sites, by their names
 Sites = dict[str, dict[str, Any]]  # a trace of a NumPyro model
 Args = tuple[Any, ...]  # of the model: whatever it takes
 Keywords = dict[str, Any]
@@ -42,7 +42,7 @@ class EllipticalSliceState(NamedTuple):
       rng_key: key of the next draw.
     """
 
-    z: Values
+    z: SiteValues
     log_likelihood: Float[Array, "*chains"]
     candidates: Float[Array, "*chains"]
     stuck: Bool[Array, "*chains"]
@@ -87,7 +87,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         max_candidates: int = 200,
         reference: tuple[ArrayLike, ArrayLike] | None = None,
         ellipses: Callable[[Args, Keywords], Sequence[tuple[Ellipse, int]]] | None = None,
-        log_likelihood: Callable[[Values, Args, Keywords], Float[Array, ""]] | None = None,
+        log_likelihood: Callable[[SiteValues, Args, Keywords], Float[Array, ""]] | None = None,
     ) -> None:
         self._model = model
         self._moves, self._batch = checks.whole("moves", moves), checks.whole("batch", batch)
@@ -175,7 +175,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
     def _model_ellipses(
         self,
         x: Float[Array, " n"],
-        unravel: Callable[[Float[Array, " n"]], Values],
+        unravel: Callable[[Float[Array, " n"]], SiteValues],
         key: PRNGKeyArray,
         model_args: Args,
         model_kwargs: Keywords,
@@ -215,13 +215,13 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         )
         return [(reference, max(self._moves // 2, 1)), (prior, self._moves - self._moves // 2)]
 
-    def _trace(self, key: PRNGKeyArray, values: Values, model_args: Args, model_kwargs: Keywords) -> Sites:
+    def _trace(self, key: PRNGKeyArray, values: SiteValues, model_args: Args, model_kwargs: Keywords) -> Sites:
         model = substitute(substitute(seed(self._model, key), substitute_fn=init_to_sample), data=values)
         sites: Sites = trace(model).get_trace(*model_args, **model_kwargs)
         return sites
 
     def _log_probs(
-        self, z: Values, model_args: Args, model_kwargs: Keywords
+        self, z: SiteValues, model_args: Args, model_kwargs: Keywords
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """log prior and log likelihood at z; the constants of the prior are left in."""
         # the key is never used: every latent site is substituted
@@ -231,7 +231,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         prior = sum((value for name, value in parts.items() if _is_latent(sites[name], z)), zero)
         return prior, sum((value for name, value in parts.items() if not _is_latent(sites[name], z)), zero)
 
-    def _model_log_likelihood(self, z: Values, model_args: Args, model_kwargs: Keywords) -> Float[Array, ""]:
+    def _model_log_likelihood(self, z: SiteValues, model_args: Args, model_kwargs: Keywords) -> Float[Array, ""]:
         return self._log_probs(z, model_args, model_kwargs)[1]
 
     def _check(self, sites: Sites, model_args: Args, model_kwargs: Keywords) -> None:
@@ -264,10 +264,10 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
                     "reparametrise, or sample them with different blocks of numpyro.infer.Gibbs"
                 )
 
-    def postprocess_fn(self, model_args: Args, model_kwargs: Keywords | None) -> Callable[[Values], Values]:
+    def postprocess_fn(self, model_args: Args, model_kwargs: Keywords | None) -> Callable[[SiteValues], SiteValues]:
         """From the latent sites to these and the model's deterministic ones."""
 
-        def fn(z: Values) -> Values:
+        def fn(z: SiteValues) -> SiteValues:
             model = substitute(seed(self._model, random.key(0)), data=z)
             sites = trace(model).get_trace(*model_args, **(model_kwargs or {}))
             found = {name: site["value"] for name, site in sites.items() if site["type"] == "deterministic"}
@@ -275,7 +275,7 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
 
         return fn
 
-    def get_constrain_fn(self, model_args: Args, model_kwargs: Keywords | None) -> Callable[[Values], Values]:
+    def get_constrain_fn(self, model_args: Args, model_kwargs: Keywords | None) -> Callable[[SiteValues], SiteValues]:
         """Gaussian sites are unconstrained: the identity."""
         return lambda z: z
 
@@ -317,7 +317,7 @@ def _checked_reference(mean: ArrayLike, covariance: ArrayLike) -> tuple[ArrayLik
     return mean, covariance
 
 
-def _is_latent(site: dict[str, Any], z: Values | None = None) -> bool:
+def _is_latent(site: dict[str, Any], z: SiteValues | None = None) -> bool:
     """A sample site that is not observed; once its value is substituted, one of the names in `z`."""
     if site["type"] != "sample":
         return False

@@ -90,6 +90,7 @@ def _log_ratios(problem: JointProblem, z: Float[Array, "n q"], unknowns: Unknown
         if given.width is not None:
             whitened /= given.width
             log_p += len(z) * jnp.log(given.width)
+        # eq. 7, over the density of the reference
         log_p += 0.5 * jnp.sum(whitened**2) - 0.5 * jnp.sum(z**2) / scale**2 - len(z) * jnp.log(scale)
         return log_p + jnp.sum(jnp.log(jnp.diagonal(given.root)))
 

@@ -229,7 +229,7 @@ def expectation_propagation(
 
 def _cavity(gaussian: _Gaussian, sites: _Sites) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Mean and variance of each margin without its own site (Rasmussen & Williams 2006, eq. 3.56)."""
-    cavity = 1 / np.maximum(1 - gaussian.t_variance * sites.precisions, 1e-10)
+    cavity = 1 / np.maximum(1 - gaussian.t_variance * sites.precisions, 1e-10)  # eq. 3.56
     return (gaussian.t_mean - gaussian.t_variance * sites.shifts) * cavity, gaussian.t_variance * cavity
 
 
@@ -239,7 +239,7 @@ def _matched_sites(factors: _Factors, gaussian: _Gaussian, sites: _Sites, wideni
     _, mean, variance = factors.moments(cavity_mean, cavity_variance)
     # a violated answer's factor can widen its margin: its precision is held at 0, its shift keeps the tilted mean
     precisions = np.maximum(1 / variance - 1 / cavity_variance, -np.inf if widening else 0.0)
-    return _Sites(precisions, mean * (precisions + 1 / cavity_variance) - cavity_mean / cavity_variance)
+    return _Sites(precisions, mean * (precisions + 1 / cavity_variance) - cavity_mean / cavity_variance)  # eq. 3.59
 
 
 def _moments(loadings: Float[np.ndarray, "k r"], sites: _Sites, prior_scale: float) -> _Gaussian:
@@ -252,7 +252,7 @@ def _moments(loadings: Float[np.ndarray, "k r"], sites: _Sites, prior_scale: flo
     inverse = np.linalg.inv(factor)
     half = inverse @ scaled.T
     direction = half @ sites.shifts
-    mean = prior_scale * inverse.T @ direction
+    mean = prior_scale * inverse.T @ direction  # eq. 3.53
     covariance = prior_scale**2 * inverse.T @ inverse
     log_normaliser = 0.5 * direction @ direction - np.sum(np.log(np.diag(factor)))
     return _Gaussian(mean, covariance, half.T @ direction, np.sum(half**2, axis=0), float(log_normaliser))

@@ -9,7 +9,7 @@ the weights change with it, its probabilities carry the volume |A| (reversible j
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,17 @@ import numpy as np
 from jax import Array, random
 from jaxtyping import Float, Int, PRNGKeyArray, Shaped
 
-from bayespbrl.models.likelihoods import Likelihood, Margins, Scalar, Values, WithLapses, WithTies, has_steps, log_prob
+from bayespbrl.models.likelihoods import (
+    Likelihood,
+    Margins,
+    Ordered,
+    Scalar,
+    Values,
+    WithLapses,
+    WithTies,
+    has_steps,
+    log_prob,
+)
 from bayespbrl.models.preference_problem import PreferenceProblem
 
 # Up to this many answers, padding included, the sampler makes more moves of other kinds.
@@ -225,17 +235,17 @@ def log_probabilities(problem: JointProblem, point: Point, margins: Margins) -> 
 
 
 def _likelihood(problem: JointProblem, point: Point) -> Likelihood:
-    likelihood: Likelihood = likelihood_with(problem.settings.likelihood, point)
-    return likelihood
+    return likelihood_with(problem.settings.likelihood, point)
 
 
-def likelihood_with(template: Any, point: Point) -> Any:
+def likelihood_with(template: Likelihood, point: Point) -> Likelihood:
     """The likelihood with the parameters of `point`."""
     if isinstance(template, WithTies):
-        return replace(template, ordered=likelihood_with(template.ordered, point), threshold=point.tie_threshold)
+        ordered = cast(Ordered, likelihood_with(template.ordered, point))
+        return replace(template, ordered=ordered, threshold=point.tie_threshold)
     if isinstance(template, WithLapses):
         return replace(template, attentive=likelihood_with(template.attentive, point), lapse_rate=point.lapse_rate)
-    return replace(template, steepness=point.steepness)
+    return replace(cast(Ordered, template), steepness=point.steepness)
 
 
 def stacked(problems: Sequence[PreferenceProblem]) -> PreferenceProblem:

@@ -167,6 +167,9 @@ class Probit:
         return _mixture(np.ones(1), np.array([1 / self.steepness]))
 
 
+Ordered = Mixed | Logistic | Probit  # neither lapses nor ties
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class WithLapses:
@@ -221,7 +224,7 @@ class WithTies:
       indifferent: which answers were "no difference", in the order of the margins' last axis.
     """
 
-    ordered: Mixed | Logistic | Probit
+    ordered: Ordered
     threshold: Scalar
     indifferent: Bool[Array, "*b k"] | Bool[np.ndarray, "*b k"]
 
@@ -236,9 +239,8 @@ class WithTies:
         scale = 1 + 1 / jnp.maximum(self.threshold, LEAST_SCALED)
         # Rao & Kupper (1967): p(tie) = p(t + δ) − p(t − δ)
         left = jnp.maximum(ratio - jnp.exp(lower - exponent) * of_lower, 0) * scale
-        return jnp.where(self.indifferent, exponent - jnp.log(scale), exponent), jnp.where(
-            self.indifferent, left, ratio
-        )
+        exponent = jnp.where(self.indifferent, exponent - jnp.log(scale), exponent)
+        return exponent, jnp.where(self.indifferent, left, ratio)
 
     def probit_mixture(self) -> ProbitMixture:
         """Weights (K, 2J): an ordered answer uses the half shifted by δ, a tie the difference of both."""
@@ -272,7 +274,7 @@ def with_threshold(
     """A likelihood without ties, with this threshold; `indifferent` as in `WithTies`."""
     if isinstance(likelihood, WithLapses):
         return replace(likelihood, attentive=with_threshold(likelihood.attentive, threshold, indifferent))
-    if not isinstance(likelihood, Mixed | Logistic | Probit):
+    if not isinstance(likelihood, Ordered):
         raise ValueError(f"likelihood: expected one without ties, got {type(likelihood).__name__}")
     return WithTies(likelihood, threshold, indifferent)
 
@@ -296,7 +298,7 @@ def likelihood_of(
       tie_threshold: δ; None for no ties.
       indifferent: which answers were "no difference"; goes with a threshold.
     """
-    ordered: Mixed | Logistic | Probit | WithLapses
+    ordered: Ordered | WithLapses
     if name == "mixed":
         ordered = Mixed(steepness, number_of_preferences)
     else:

@@ -6,11 +6,11 @@ computed late, bit for bit. Nothing reaches the log before the answer does.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from bayespbrl import events
 from bayespbrl.cycle import Cycle
 from bayespbrl.events import Entry, LearnerState
+from bayespbrl.people.views import Shown
 from bayespbrl.preferences import Answer, Query
 
 LIKELY = 2  # answers after which two answers are foreseen, each
@@ -35,7 +35,7 @@ class Moment:
     holders: Mapping[int, str | None] = field(default_factory=dict)
     entries: list[Entry] = field(default_factory=list)
     settled: bool = False
-    shown: dict[int, Any] = field(default_factory=dict)
+    shown: dict[int, Shown] = field(default_factory=dict)
     likely: dict[int, tuple[Answer, ...]] = field(default_factory=dict)
     after: dict[tuple[int, Answer], "Moment"] = field(default_factory=dict)
     failed: bool = False
@@ -66,7 +66,7 @@ class Foresight:
         self,
         cycle: Cycle,
         state: LearnerState,
-        show: Callable[[LearnerState, Query], tuple[Any, tuple[Answer, ...]]],
+        show: Callable[[LearnerState, Query], tuple[Shown, tuple[Answer, ...]]],
         people: Sequence[str | None] = (None,),
         *,
         several: bool = False,

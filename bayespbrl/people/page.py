@@ -14,7 +14,6 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Mapping
 from importlib.resources import files
-from typing import Any
 
 import uvicorn
 from starlette.applications import Starlette
@@ -164,11 +163,13 @@ class Page:
             return PlainTextResponse(" ".join(str(error).split())[:300], 400)
         return Response(status_code=204)
 
-    def _take(self, seat: Seat, key: str | None, turn: int, *given: Any) -> None:
+    def _take(
+        self, seat: Seat, key: str | None, turn: int, answer: str, seconds: float | None, replays: int | None
+    ) -> None:
         """`Seat.answer`, once where the same message is sent again because its reply was lost."""
         with self.session.changed:
             if key is None or self._heard.get(turn) != key:
-                seat.answer(turn, *given)
+                seat.answer(turn, answer, seconds, replays)
                 self._heard[turn] = key
 
     async def _events(self, request: Request) -> Response:

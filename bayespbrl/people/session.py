@@ -159,7 +159,7 @@ class Session:
             elif answer == Answer.UNDO:
                 self._undo(seat)
             else:
-                self._take(seat, answer, {"seconds": seconds, "replays": replays})
+                self._take(seat, answer, seconds, replays)
             self._settle()
 
     def _turn(self, seat: Seat) -> None:
@@ -175,10 +175,11 @@ class Session:
         self._turn(seat)
         self._foresight.back(number, self.learner.state, seat.answerer)
 
-    def _take(self, seat: Seat, answer: str, how: dict[str, Any]) -> None:
+    def _take(self, seat: Seat, answer: str, seconds: float | None, replays: int | None) -> None:
         number, given = seat.number, parse_answer(answer)
         assert number is not None
-        self._record(events.answered(number, given, answerer=seat.answerer, session=self.name, **how))
+        who = {"answerer": seat.answerer, "session": self.name}
+        self._record(events.answered(number, given, seconds=seconds, replays=replays, **who))
         self._turn(seat)
         moment = self._foresight.move(number, given, self.learner.state)
         try:
@@ -194,7 +195,7 @@ class Session:
         try:
             self.learner.record(entry)
         except OSError as error:
-            raise ValueError(f"your answer was not kept: {' '.join(str(error).split())}") from error
+            raise ValueError(f"your answer was not kept: {checks.in_one_line(error)}") from error
 
     # The thread that thinks.
 
@@ -232,7 +233,7 @@ class Session:
     def _failed(self, moment: Moment, error: Exception) -> None:
         moment.failed = True
         if moment is self._foresight.present:
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = checks.in_one_line(error)
             for seat in self.seats:
                 seat.set(self._described(seat, FAILED) | {"say": f"Stopped: {reason} Your answers are kept."})
 

@@ -33,7 +33,7 @@ def initial_policy(
     observation_space: Space[Any],
     action_space: Space[Any],
     *,
-    action_scale: float = 0.75,
+    action_scale: float,
     period: ArrayLike | None = None,
 ) -> Policy:
     """The first policy of a run: as random as the action space allows.

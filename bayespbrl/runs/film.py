@@ -6,11 +6,12 @@ import gymnasium
 import jax
 import numpy as np
 
-from bayespbrl import rollouts
+from bayespbrl import checks, rollouts
 from bayespbrl.envs import pictures
 from bayespbrl.envs.opening import environment_attribute, environment_name, flattened, made_from
 from bayespbrl.learner import Learner
 from bayespbrl.policies.actor import Actor
+from bayespbrl.runs.files import written_aside
 
 FRAMES = 60  # pictures in the GIF of a drawn episode; where the environment renders itself, at most twice as many
 
@@ -40,15 +41,17 @@ def film_policy(learner: Learner, directory: Path) -> tuple[Path, Path]:
                 episodes=episodes,
                 max_steps=settings.rollouts.max_steps,
             )[0]
-            pictures.film(environment, shown, film, max_frames=FRAMES)
-            pictures.drawing(environment, shown, strip)
+            with written_aside(film) as gif, written_aside(strip) as png:
+                pictures.film(environment, shown, gif, max_frames=FRAMES)
+                pictures.drawing(environment, shown, png)
         else:
             frames, milliseconds = _rendered(learner)
-            pictures.animation(frames, film, milliseconds=milliseconds)
-            pictures.contact_sheet(frames, strip)
+            with written_aside(film) as gif, written_aside(strip) as png:
+                pictures.animation(frames, gif, milliseconds=milliseconds)
+                pictures.contact_sheet(frames, png)
     except Exception as error:  # whatever a drawing or rendering of the user's raises
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"environment {environment_name(environment)} cannot be rendered: {reason}") from error
+        name, reason = environment_name(environment), checks.in_one_line(error)
+        raise ValueError(f"environment {name} cannot be rendered: {reason}") from error
     return film, strip
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from bayespbrl import checks
 from bayespbrl.events import Entry
 from bayespbrl.features import StateFeatures, checked_features
 from bayespbrl.models import restored, stored
@@ -73,7 +74,7 @@ def read_parts(
         _check_numbers(tree)
         parts = {name: read[name](tree) for name in names}
     except (OSError, KeyError, RuntimeError, AttributeError, TypeError, ValueError, MemoryError, IndexError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = checks.in_one_line(error)
         raise ValueError(f"{file.name}: expected the netCDF file of an iteration, got {reason}") from error
     return parts
 

@@ -16,7 +16,7 @@ from bayespbrl.utility.quality import FitQuality
 class UtilityEstimate(Protocol):
     """An estimate of the expert's utility: a point, or a posterior with draws.
 
-    `posterior` says which. Where it is None the methods that need one (those below `likelihood`) raise a ValueError.
+    `posterior` says which. Where it is None the methods that need one (from `likelihood` on) raise a ValueError.
     `features` says whether it is a utility of states; where it is None, `utilities` raises a ValueError.
     """
 
@@ -41,7 +41,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def thinned(self, number: int) -> Self:
-        """The same with at most `number` draws, in memory; itself where there are none."""
+        """At most `number` of the draws, for `utilities` and `utilities_and_draws` alone; itself without draws."""
         ...
 
     def hyperparameters(self) -> dict[str, Any] | None:
@@ -93,7 +93,7 @@ class UtilityEstimate(Protocol):
         ...
 
 
-def refused(asked: str, needed: str = "an estimate with a posterior") -> Callable[..., Any]:
+def refused(asked: str, needed: str = "an estimate with a posterior") -> Callable[..., NoReturn]:
     """A method that raises a ValueError, for an estimate without what the method needs."""
 
     def method(self: object, *arguments: Any, **options: Any) -> NoReturn:

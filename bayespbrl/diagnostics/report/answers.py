@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 
+import gymnasium
 import numpy as np
 import xarray as xr
 
@@ -35,7 +36,7 @@ def answers(contents: RunContents, table: xr.Dataset) -> Body:
     if contents.environment is None:
         text.append("The trajectories cannot be drawn, because the environment cannot be opened.")
     else:
-        blocks += _comparisons(contents, table, order[:PICTURED])
+        blocks += _comparisons(contents, contents.environment, table, order[:PICTURED])
     return text, [*blocks, _rows(table, order)]
 
 
@@ -48,7 +49,9 @@ def surprise_order(table: xr.Dataset) -> np.ndarray:
     return np.argsort(key, kind="stable")  # NaN last
 
 
-def _comparisons(contents: RunContents, table: xr.Dataset, order: Sequence[int] | np.ndarray) -> list[Comparison]:
+def _comparisons(
+    contents: RunContents, environment: gymnasium.Env, table: xr.Dataset, order: Sequence[int] | np.ndarray
+) -> list[Comparison]:
     pictures: dict[int, Picture] = {}
     blocks = []
     for place, k in enumerate(order):
@@ -56,7 +59,7 @@ def _comparisons(contents: RunContents, table: xr.Dataset, order: Sequence[int] 
         shown = [n for n in (answer.first, answer.second) if n in contents.compared]
         for n in shown:
             if n not in pictures:
-                draw = partial(draw_trajectory, contents.environment, contents.compared[n])
+                draw = partial(draw_trajectory, environment, contents.compared[n])
                 pictures[n] = thumbnail(f"trajectory-{n}", draw, f"trajectory {n}", f"Drawing of trajectory {n}.")
         title = f"Question {answer.question}: {_in_words(answer)}"
         both = tuple(pictures[n] for n in shown)
