@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int, Key, Shaped
 from bayespbrl.checks import whole
 from bayespbrl.envs import functional
 from bayespbrl.envs.functional import FunctionalEnv
-from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, environment_name, open_environment
+from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, environment_name, layers, open_environment
 from bayespbrl.envs.stepping import episodes_by_interface, outside_of
 from bayespbrl.policies.policy import AnyArray, Sampler
 from bayespbrl.trajectories import Trajectory
@@ -141,7 +141,7 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
     env = open_environment(environment)
     if max_steps is not None:
         return whole("max_steps", max_steps)
-    limits: list[int | None] = [layer._max_episode_steps for layer in _layers(env) if isinstance(layer, TimeLimit)]
+    limits: list[int | None] = [layer._max_episode_steps for layer in layers(env) if isinstance(layer, TimeLimit)]
     limits.append(env.spec.max_episode_steps if env.spec is not None else None)
     limits.append(environment_attribute(env, "max_episode_steps"))
     for limit in limits:
@@ -159,16 +159,9 @@ def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episode
     return step_limit(env, max_steps)
 
 
-def _layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
-    while isinstance(env, gymnasium.Wrapper):
-        yield env
-        env = env.env
-    yield env
-
-
 def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
     """The pure functions; None where a wrapper or subclass, such as a user's, may change the environment."""
-    *wrappers, inner = _layers(env)
+    *wrappers, inner = layers(env)
     harmless = all(isinstance(layer, TimeLimit | OrderEnforcing | PassiveEnvChecker) for layer in wrappers)
     if not (isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and harmless and _is_pytree(policy)):
         return None

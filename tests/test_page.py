@@ -173,6 +173,35 @@ def test_a_key_that_is_held_or_pressed_twice_answers_once(browser, gridworld):
         assert answers_of(gridworld) == ["first"]
 
 
+def test_the_second_half_of_a_double_click_or_key_is_no_answer_to_the_next_question(browser, gridworld):
+    again = """() => {
+      const box = document.querySelector(".bp-box"), second = document.querySelector("[data-answer=second]");
+      new MutationObserver((changes, observer) => {
+        observer.disconnect();
+        document.body.dispatchEvent(new KeyboardEvent("keydown", {key: "ArrowRight", bubbles: true}));
+        second.dispatchEvent(new MouseEvent("click", {bubbles: true, detail: 1}));
+      }).observe(box, {attributeFilter: ["data-turn"]});
+    }"""
+    with tab(browser, gridworld) as opened:
+        opened.evaluate(again)  # as soon as the next question is there
+        press(opened, "first")
+        assert answers_of(gridworld) == ["first"]
+        second = opened.locator("[data-answer=second]")
+        second.dispatch_event("click", {"detail": 2})
+        assert opened.is_visible(READY)
+        press(opened, "tie")
+        assert answers_of(gridworld) == ["first", "tie"]
+
+
+def test_after_the_mouse_has_moved_the_clips_keys_answer_and_the_next_clips_play(browser, gridworld):
+    with tab(browser, gridworld) as opened:
+        opened.click(".bp-scrub")
+        assert opened.get_attribute(".bp-play", "data-playing") == "false"
+        press(opened, "second")
+        assert answers_of(gridworld) == ["second"]
+        assert opened.get_attribute(".bp-play", "data-playing") == "true"
+
+
 def test_a_reload_and_a_second_tab_show_the_same_question_and_count_no_answer_twice(browser, gridworld):
     with tab(browser, gridworld) as opened, tab(browser, gridworld) as other:
         press(opened, "first")
@@ -260,6 +289,32 @@ def test_a_page_that_hears_no_more_views_says_so_and_goes_on_when_it_hears_them_
         assert answers_of(gridworld) == ["second"]
 
 
+def test_a_page_that_is_not_answered_for_long_says_what_to_do_and_goes_on_when_it_is(browser, gridworld):
+    gridworld.session.wait(timeout=60)
+    back, tried = threading.Event(), []
+
+    def before(opened):
+        opened.add_init_script("const now = performance.now.bind(performance); performance.now = () => 20 * now()")
+        opened.route("**/events", listened)
+
+    def listened(route):
+        tried.append(route)
+        if back.is_set():
+            return route.continue_()
+        if len(tried) > 1:
+            return route.abort()
+        return route.fulfill(body=f"data: {json.dumps(gridworld.session.view)}\n\n", content_type="text/event-stream")
+
+    with tab(browser, gridworld, before=before) as opened:
+        opened.wait_for_selector(".bp-note >> text=start it again")
+        assert opened.get_attribute(".bp-box", "data-locked") == "true"
+        opened.keyboard.press("ArrowLeft")
+        back.set()
+        opened.wait_for_selector(".bp-note", state="hidden")
+        press(opened, "second")
+        assert answers_of(gridworld) == ["second"]
+
+
 @pytest.mark.parametrize("heard", [False, True])
 def test_an_answer_whose_connection_is_lost_is_sent_again_and_counts_once(browser, gridworld, heard):
     """The request is lost, or (`heard`) its reply."""
@@ -323,6 +378,7 @@ def test_it_can_be_used_with_reduced_motion_on_a_phone_and_by_a_screen_reader(br
         assert opened.evaluate("document.documentElement.scrollWidth") <= 360
         assert opened.get_attribute("canvas", "aria-label") == "First: 20 steps"
         assert "Which one is better?" in opened.inner_text("[aria-live=polite]")
+        assert opened.locator("[aria-live], [role=status], [role=alert], [role=log], output").count() == 2  # that speak
         names = opened.evaluate(
             "[...document.querySelectorAll('button')].map((b) => b.ariaLabel ?? b.innerText.trim())"
         )
@@ -575,7 +631,8 @@ def test_ctrl_c_ends_a_sitting_with_its_status_and_the_same_command_goes_on(tmp_
         try:
             lines = iter(server.stdout.readline, "")
             address = urlsplit(next(line.strip() for line in lines if line.startswith("http://")))
-            for view in person._views(address):
+            views = person._views(address)  # they stay open, as in a browser
+            for view in views:
                 if view["phase"] == "question" and view["answered"] == 1:
                     break
                 if view["phase"] == "question":

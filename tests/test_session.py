@@ -22,10 +22,11 @@ from toys import QUICK, Slope, fingerprint
 import bayespbrl
 from bayespbrl.cli.commands import main
 from bayespbrl.cli.opening import ELSEWHERE, open_in_browser, somebody_looks
+from bayespbrl.envs.opening import open_environment
 from bayespbrl.events import LearnerState
 from bayespbrl.models.likelihoods import Logistic
 from bayespbrl.people.clips import MOST_BYTES, Clips
-from bayespbrl.people.drawing import SCENES
+from bayespbrl.people.drawing import SCENES, scene_of
 from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.plots import observation_names
 from bayespbrl.people.practice import practice_queries
@@ -481,6 +482,31 @@ def test_shipped_tasks_and_classics_are_drawn_from_their_observations(env):
 
     clips = checked_clips(learner, Query(1, 0, 1, 1, (trajectory(20), trajectory(12))))
     assert [(clip.width, clip.frames) for clip in clips] == [(320, 21), (320, 13)]
+
+
+class Mirrored(gymnasium.ObservationWrapper):
+    """Other observations in the same space."""
+
+    def observation(self, observation):
+        return -observation
+
+
+class OneEntry(Mirrored):
+    """One entry of the observation."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = Box(-1, 1, (1,))
+
+    def observation(self, observation):
+        return observation[:1]
+
+
+@pytest.mark.parametrize("wrapper", [Mirrored, OneEntry])
+def test_an_environment_whose_wrapper_gives_other_observations_is_not_drawn_from_them(wrapper):
+    assert scene_of(open_environment("Pendulum-v1")) is not None
+    assert scene_of(open_environment(gymnasium.make("Pendulum-v1"))) is not None
+    assert scene_of(open_environment(wrapper(gymnasium.make("Pendulum-v1")))) is None
 
 
 def test_an_environment_that_renders_is_filmed_by_itself():

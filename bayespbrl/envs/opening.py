@@ -1,6 +1,7 @@
 """Any gymnasium environment, made ready for the learner: opened by name, its spaces checked and flattened."""
 
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -110,9 +111,24 @@ def environment_attribute(env: gymnasium.Env, name: str) -> Any:
 
     None too where it is about the observations, and a wrapper gives others.
     """
-    if name in OF_OBSERVATIONS and as_given(env).observation_space != env.unwrapped.observation_space:
+    if name in OF_OBSERVATIONS and observed_otherwise(env):
         return None
     return getattr(getattr(env.unwrapped, "dynamics", None), name, None)
+
+
+def observed_otherwise(env: gymnasium.Env) -> bool:
+    """Whether a wrapper gives other observations than the environment itself."""
+    given, inner = as_given(env), env.unwrapped
+    wrapped = any(isinstance(layer, gymnasium.ObservationWrapper) for layer in layers(given))
+    return wrapped or given.observation_space != inner.observation_space
+
+
+def layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
+    """The environment with its wrappers, the outermost first."""
+    while isinstance(env, gymnasium.Wrapper):
+        yield env
+        env = env.env
+    yield env
 
 
 def _spec(environment: str | EnvSpec) -> EnvSpec:

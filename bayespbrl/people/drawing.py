@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 
 from bayespbrl.envs import acrobot
 from bayespbrl.envs.bicycle import FALL_ANGLE
-from bayespbrl.envs.opening import environment_attribute
+from bayespbrl.envs.opening import environment_attribute, observed_otherwise
 
 SIDE = 320  # pixels of a picture
 FINER = 2  # drawn larger and reduced: smooth edges
@@ -128,7 +128,7 @@ SCENES: dict[str, Scene] = {
 def scene_of(environment: Env) -> Scene | None:
     """How an observation of the environment is drawn; None where no drawing is known."""
     name = environment.spec.id if environment.spec is not None else ""
-    if name in SCENES:
+    if name in SCENES and not observed_otherwise(environment):
         return SCENES[name]
     pose = environment_attribute(environment, "pose")
     return None if pose is None else limbs(pose)

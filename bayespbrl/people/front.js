@@ -17,6 +17,7 @@ const SAID = {
 };
 const LOST = "The connection is lost. Trying again…";
 const MOST_REPLAYS = 10000; // that are sent
+const HASTE = 300; // milliseconds after which a question takes an answer: a double click is one answer
 const REST = 0.8; // seconds on the last picture before the clips start again
 
 const HTML = `
@@ -57,7 +58,7 @@ const HTML = `
     <button type="button" class="bp-play" aria-label="Pause" title="Pause or play (space)"></button>
     <button type="button" class="bp-again" aria-label="From the start" title="From the start"></button>
     <input class="bp-scrub" type="range" min="0" max="1000" value="0" step="1" aria-label="Time">
-    <output class="bp-step"></output>
+    <span class="bp-step"></span>
     <label class="bp-speed">Speed <select aria-label="Speed">
       <option value="0.5">0.5 ×</option><option value="1" selected>1 ×</option>
       <option value="2">2 ×</option><option value="4">4 ×</option></select></label>
@@ -68,7 +69,7 @@ const HTML = `
     <button type="button" data-answer="undo"><span>Undo</span><kbd>U</kbd></button>
   </div>
   <p class="bp-learner"></p>
-  <p class="bp-note" hidden></p>
+  <p class="bp-note" role="alert" hidden></p>
   <p class="bp-live" role="status" aria-live="polite"></p>
 </div>`;
 
@@ -96,11 +97,13 @@ class Film {
       canvas.height = clips[k].height;
       canvas.dataset.frame = "";
     });
+    if (this.resumes) this.play(true);
     this.draw();
   }
 
   play(playing) {
     this.playing = playing;
+    this.resumes = false;
     this.button.dataset.playing = playing;
     this.button.setAttribute("aria-label", playing ? "Pause" : "Play");
   }
@@ -108,6 +111,14 @@ class Film {
   move(at) {
     this.at = Math.max(0, Math.min(at, this.longest));
     this.draw();
+  }
+
+  // A person moves the clips by hand, until the next question.
+  seek(at) {
+    const resumes = this.playing || this.resumes;
+    this.play(false);
+    this.resumes = resumes;
+    if (this.clips.length) this.move(at * this.longest);
   }
 
   again() {
@@ -138,8 +149,8 @@ class Film {
       canvas.dataset.step = (frame / Math.max(1, frames - 1)) * steps;
     });
     const text = `step ${Math.round(at)} of ${this.longest}`;
-    if (this.step.value === text) return;
-    this.step.value = text;
+    if (this.step.textContent === text) return;
+    this.step.textContent = text;
     this.scrub.value = Math.round((1000 * at) / this.longest);
     this.scrub.setAttribute("aria-valuetext", text);
   }
@@ -166,7 +177,7 @@ function render({ model, el }) {
   const find = (name) => root.querySelector(name);
   const [box, ask, note, live] = [".bp-box", ".bp-ask", ".bp-note", ".bp-live"].map(find);
   const film = new Film(box);
-  let view = {}, alive = true, locked = true, answered = null, shown = 0, loads = 0, loaded = null, slow;
+  let view = {}, alive = true, locked = true, answered = null, shown = 0, loads = 0, loaded = null, gone = false, slow, soon;
 
   function lock(yes) {
     locked = yes;
@@ -197,6 +208,7 @@ function render({ model, el }) {
   }
 
   async function take() {
+    clearTimeout(soon);
     view = model.get("view") ?? {};
     box.dataset.phase = view.phase ?? "thinking";
     progress();
@@ -225,11 +237,13 @@ function render({ model, el }) {
     find(".bp-learner").textContent = learnerText(view);
     if (view.turn === answered) return; // the answer is on its way
     const known = box.dataset.turn === String(view.turn); // others have answered, or this turn's answer was refused
-    lock(false);
+    const early = HASTE - (performance.now() - shown);
+    lock(early > 0);
+    if (early > 0) soon = setTimeout(() => lock(false), early);
     box.dataset.turn = view.turn;
     const which = view.practice ? `Practice ${view.practice.join(" of ")}: which one is better?` : "Which one is better?";
     const number = view.practice ? "" : `Question ${view.answered + 1}. `;
-    say(which, known ? live.textContent : `${number}${which} ${view.notice} Left arrow: first. Right arrow: second.`);
+    say(which, known ? live.textContent : `${number}${which} ${view.notice} Left arrow: first. Right arrow: second. ${view.advice ?? ""}`);
     if (!known) focus();
   }
 
@@ -260,8 +274,17 @@ function render({ model, el }) {
 
   function hear(message) {
     if (message.connection === "lost" && note.hidden) warn(LOST);
-    if (message.connection === "gone") { lock(true); warn(message.say); }
-    if (message.connection === "back" && note.textContent === LOST) warn(null);
+    if (message.connection === "gone") {
+      gone = true;
+      clearTimeout(soon);
+      lock(true);
+      warn(message.say);
+    }
+    if (message.connection === "back" && (gone || note.textContent === LOST)) {
+      warn(null);
+      if (gone) take();
+      gone = false;
+    }
     if (message.refused === undefined || message.refused !== answered) return;
     answered = null;
     clearTimeout(slow);
@@ -285,17 +308,22 @@ function render({ model, el }) {
 
   const keys = model.get("whole_page") ? window : box;
   keys.addEventListener("keydown", key);
-  root.addEventListener("click", ({ target }) => {
+  root.addEventListener("click", ({ target, detail }) => {
     const button = target.closest("[data-answer]");
-    if (button) answer(button.dataset.answer);
+    if (button && detail < 2) answer(button.dataset.answer);
   });
   film.button.addEventListener("click", () => film.play(!film.playing));
   find(".bp-again").addEventListener("click", () => film.clips.length && film.again());
-  find(".bp-speed select").addEventListener("change", ({ target }) => { film.speed = Number(target.value); });
-  film.scrub.addEventListener("input", () => {
-    film.play(false);
-    if (film.clips.length) film.move((film.scrub.value / 1000) * film.longest);
+  let pointed = false; // whether the speed is chosen by a pointer, not by keys
+  const speed = find(".bp-speed select");
+  speed.addEventListener("pointerdown", () => { pointed = true; });
+  speed.addEventListener("keydown", () => { pointed = false; });
+  speed.addEventListener("change", () => {
+    film.speed = Number(speed.value);
+    if (pointed) box.focus({ preventScroll: true });
   });
+  film.scrub.addEventListener("input", () => film.seek(film.scrub.value / 1000));
+  film.scrub.addEventListener("pointerup", () => box.focus({ preventScroll: true })); // its keys answer again
 
   (function paint(now) {
     if (!alive) return;
@@ -309,6 +337,7 @@ function render({ model, el }) {
   return () => {
     alive = false;
     clearTimeout(slow);
+    clearTimeout(soon);
     keys.removeEventListener("keydown", key);
     model.off("change:view", take);
     model.off("msg:custom", hear);

@@ -5,9 +5,9 @@ const state = { view: {}, whole_page: true };
 const listeners = {};
 const fire = (event, message) => (listeners[event] ?? []).forEach((callback) => callback(message));
 const pause = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
-const GONE = "The program behind this page has ended. Start it again and open the address that it prints.";
+const GONE = "The program behind this page does not answer. If it has ended, start it again and open the address that it prints.";
 const ELSEWHERE = "This question was answered in another window, or by another person. That answer counts, and yours does not.";
-const PATIENCE = 20; // seconds without a server until the page stops trying
+const PATIENCE = 20; // seconds without a server until the page says that it may have ended, and tries less often
 
 const model = {
   get: (name) => state[name],
@@ -32,9 +32,8 @@ async function post(message) {
       fire("msg:custom", { refused: message.turn, say: reply.status === 409 ? ELSEWHERE : await reply.text() });
       return;
     } catch {
-      if (ended()) return;
-      fire("msg:custom", { connection: "lost" });
-      await pause(500);
+      if (over()) return;
+      await missed();
     }
   }
 }
@@ -57,7 +56,7 @@ async function take(view) {
     } catch {
       if (mine !== newest) return;
       await pause(500); // the next view may be here by then
-      if (mine === newest && !ended()) await take(view);
+      if (mine === newest && !over()) await take(view);
       return;
     }
   }
@@ -68,7 +67,14 @@ async function take(view) {
 
 let source, lost = null;
 const over = () => ["finished", "failed"].includes(state.view.phase);
-const ended = () => over() || (lost !== null && performance.now() - lost > 1000 * PATIENCE);
+
+// Says that the server was not reached, and waits until it is time to try again.
+async function missed() {
+  lost ??= performance.now();
+  const gone = performance.now() - lost > 1000 * PATIENCE;
+  fire("msg:custom", gone ? { connection: "gone", say: GONE } : { connection: "lost" });
+  await pause(gone ? 3000 : 500);
+}
 
 function listen() {
   source = new EventSource("events");
@@ -80,10 +86,8 @@ function listen() {
   source.onerror = async () => {
     source.close();
     if (over()) return;
-    lost ??= performance.now();
-    fire("msg:custom", ended() ? { connection: "gone", say: GONE } : { connection: "lost" });
-    await pause(500);
-    if (!ended()) listen();
+    await missed();
+    listen();
   };
 }
 

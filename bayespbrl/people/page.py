@@ -28,6 +28,7 @@ from bayespbrl.people.session import Session, answer_of
 
 LARGEST_BODY = 4096  # bytes
 HEARTBEAT = 10.0  # seconds between signs of life
+EVERYWHERE = ("0.0.0.0", "::")  # hosts that stand for all addresses of this machine
 FAREWELL = 1.5  # seconds for the last view to arrive
 KINDS = {"front.js": "text/javascript", "host.js": "text/javascript", "front.css": "text/css"}
 SHELL = """<!doctype html>
@@ -83,7 +84,7 @@ class Page:
         config = uvicorn.Config(
             self._application(), log_level="warning", access_log=False, timeout_graceful_shutdown=1, lifespan="off"
         )
-        self._server = uvicorn.Server(config)
+        self._server = _Server(config)
 
     @property
     def address(self) -> str:
@@ -93,7 +94,7 @@ class Page:
     @property
     def addresses(self) -> list[str]:
         """What each person opens in a browser."""
-        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        host = _outward(self.host) if self.host in EVERYWHERE else self.host
         host = f"[{host}]" if ":" in host else host
         return [f"http://{host}:{self.port}/{token}/" for token in self._seats]
 
@@ -184,6 +185,7 @@ class Page:
                 loop.call_soon_threadsafe(changed.set)
 
         deaf, sent = seat.listen(wake), None
+        self._server.streams.add(changed)
         try:
             while not self._server.should_exit:
                 changed.clear()
@@ -194,6 +196,20 @@ class Page:
                     await asyncio.wait_for(changed.wait(), HEARTBEAT)
         finally:
             deaf()
+            self._server.streams.discard(changed)
+
+
+class _Server(uvicorn.Server):
+    """Wakes the open event streams when it ends, so that they end by themselves."""
+
+    def __init__(self, config: uvicorn.Config):
+        super().__init__(config)
+        self.streams: set[asyncio.Event] = set()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        for changed in self.streams:
+            changed.set()
+        await super().shutdown(sockets)
 
 
 def seat_of(request: Request) -> Seat:
@@ -240,8 +256,18 @@ class Guard:
         return _is_address(name.strip("[]"), self.host) and origin in (None, f"http://{host}")
 
 
+def _outward(host: str) -> str:
+    """The address by which others reach this machine; its name where it is in no network."""
+    family, there = (socket.AF_INET6, "2001:db8::1") if ":" in host else (socket.AF_INET, "192.0.2.1")
+    with socket.socket(family, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+        probe.connect((there, 9))  # sends nothing; the address is one for documentation (RFC 5737, RFC 3849)
+        return str(probe.getsockname()[0])
+    return socket.gethostname()
+
+
 def _is_address(name: str, host: str) -> bool:
-    if name.lower() in ("localhost", host.lower(), socket.gethostname().lower()):  # browsers write names in lower case
+    name, own = name.lower(), socket.gethostname().lower()  # browsers write names in lower case
+    if name in ("localhost", host.lower(), own) or (host in EVERYWHERE and name == f"{own}.local"):
         return True
     try:
         address = ipaddress.ip_address(name)
