@@ -141,7 +141,9 @@ def one_run(seed: int, *, drawn: bool = False) -> dict[str, float]:
 
 
 def _log_score(tree: xr.DataTree, order: Questions, answers: Answers) -> float:
-    """Mean log probability of the stated orders, given that an order is stated."""
+    """Mean log probability of the stated orders, given that an order is stated; NaN where none is."""
+    if not len(order.answer):
+        return float("nan")
     probabilities = answer_probabilities(tree, order.rows, answers)
     return float(np.mean(np.log(probabilities[:, PREFERRED] / probabilities[:, [PREFERRED, DOMINATED]].sum(axis=1))))
 
@@ -155,9 +157,11 @@ def show(rows: Sequence[dict[str, float]]) -> None:
         truth, mean = (np.mean([row[f"{name} {end}"] for row in rows]) for end in ("true", "mean"))
         print(f"{name}: true {truth:.2f}, posterior mean {mean:.2f} (means over the runs); ", end="")
         print(f"covered {share.estimate:.3f} [{share.low:.3f}, {share.high:.3f}]")
+    rows = [row for row in rows if row["stated"]]
     gain = np.array([row["log score"] - row["log score without"] for row in rows])
     reach = stats.t.ppf(0.975, len(gain) - 1) * gain.std(ddof=1) / np.sqrt(len(gain))
     without = np.mean([row["log score without"] for row in rows])
+    print(f"{len(rows)} runs in which an order was stated afterwards: ", end="")
     print(f"log score an answer {without + gain.mean():.4f}, without these parts {without:.4f}")
     print(f"difference {gain.mean():.4f} [{gain.mean() - reach:.4f}, {gain.mean() + reach:.4f}] (paired, 95 %)")
 
