@@ -91,7 +91,9 @@ class Cycle:
 
     def _newcomers(self, state: LearnerState) -> list[int]:
         """The candidates that no open question compares with their opponents."""
-        taken, standing = [{query.first, query.second} for query in state.open], state.preferences.undominated
+        taken = [{query.first, query.second} for query in state.open]
+        taken += [{past.first, past.second} for past in state.past if state.opponents]  # also of each other
+        standing = state.preferences.undominated
         # an opponent of this iteration that is now undominated would compete with itself
         left = set(state.candidates).difference(standing, (query.newcomer for query in state.open))
         pairs = {number: {number, state.opponents.get(number, *standing[-1:])} for number in state.candidates}
@@ -306,8 +308,7 @@ class Cycle:
 
     def update(self, state: LearnerState, utility: UtilityEstimate, check: Check | None) -> tuple[Improvement, Bound]:
         """Step 2: an update is proposed, the schedule decides on its bound, the update is applied."""
-        settings, iteration = self.settings, state.iteration
-        number = settings.rollouts.trajectories_per_iteration
+        settings, iteration, number = self.settings, state.iteration, self.settings.rollouts.trajectories_per_iteration
         since_start = state.trajectories[number * state.started :]
         taken = recent(since_start, settings.update, an_iteration=number)
         steps = transitions(taken)
@@ -325,8 +326,7 @@ class Cycle:
             self.environment.action_space,
             quarters(taken) if needs_draws else None,
         )
-        stepped_back = check is not None and check.stepped_back
-        policy = state.best_policy if stepped_back else state.policy
+        policy = state.best_policy if check is not None and check.stepped_back else state.policy
         proposed = propose(policy, problem, key=key, utility_draws=draws)
         usual, answers = settings.update.kl_bound, state.preferences.answers
         bound = schedules.decide(self.schedule, Situation(iteration + 1, answers, usual, utility, proposed))

@@ -293,14 +293,14 @@ class FeatureSource:
     ) -> StateFeatures:
         """φ(s), the user's or drawn at all states of the trajectories.
 
-        Where none of them ended before the time limit, all are equally long, and there is no constant feature.
+        Where all are equally long and none ended by itself, there is no constant feature.
         """
         if self.own is not None:
             return partial(checked_features, self.own)
         space = self.observation_space
         if options.diffusion and isinstance(space, Discrete) and space.n <= MOST_CONNECTED:
             return diffusion_basis(trajectories, int(space.n))
-        if not any(trajectory.terminated for trajectory in trajectories):
+        if len({len(each) for each in trajectories}) == 1 and not any(each.terminated for each in trajectories):
             options = replace(options, constant=False)
         observed = np.concatenate([trajectory.states for trajectory in trajectories])
         return draw_state_features(self.observation_space, observed, self._periodic(options), rng=rng)

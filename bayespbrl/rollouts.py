@@ -141,7 +141,8 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
     env = open_environment(environment)
     if max_steps is not None:
         return whole("max_steps", max_steps)
-    limits: list[int | None] = [layer._max_episode_steps for layer in layers(env) if isinstance(layer, TimeLimit)]
+    wrapped = [layer._max_episode_steps for layer in layers(env) if isinstance(layer, TimeLimit)]
+    limits: list[int | None] = [min(wrapped, default=None)]
     limits.append(env.spec.max_episode_steps if env.spec is not None else None)
     limits.append(environment_attribute(env, "max_episode_steps"))
     for limit in limits:
@@ -162,7 +163,7 @@ def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episode
 def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
     """The pure functions; None where a wrapper or subclass, such as a user's, may change the environment."""
     *wrappers, inner = layers(env)
-    harmless = all(isinstance(layer, TimeLimit | OrderEnforcing | PassiveEnvChecker) for layer in wrappers)
+    harmless = all(type(layer) in (TimeLimit, OrderEnforcing, PassiveEnvChecker) for layer in wrappers)
     if not (isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and harmless and _is_pytree(policy)):
         return None
     return inner.dynamics
@@ -193,7 +194,16 @@ def _where(step: int) -> str:
 def _start(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Running, Key[Array, ""]]:
     start_key, steps_key = jax.random.split(key)
     state, observation = functional.reset(dynamics, start_key)
+    state = _of_later_types(dynamics, start_key, state)
     return (state, _wide(dynamics, observation), jnp.asarray(True)), steps_key
+
+
+def _of_later_types(dynamics: FuncEnv, key: Key[Array, ""], state: Any) -> Any:
+    """A first state with the types of later ones: whole numbers may become others after a step."""
+    space = dynamics.action_space
+    action = jnp.zeros(space.shape or (), float if isinstance(space, Box) else int)
+    later = jax.eval_shape(partial(functional.step, dynamics), key, state, action)[0]
+    return jax.tree.map(lambda a, b: a if a.dtype == b.dtype else a.astype(b.dtype), state, later)
 
 
 def _advance(

@@ -50,6 +50,19 @@ def test_the_budget_ends_the_questions_and_the_run_a_little_later(run):
     assert run.settings.iterations is None
 
 
+@pytest.mark.parametrize(("seed", "skips"), [(2, False), (5, True)])
+def test_no_two_from_one_start_are_asked_about_twice(seed, skips):
+    options = {"answers": 8, "same_start": True, "queries_per_iteration": 3, "worthwhile": False, "iterations": 5}
+    learner = Learner(Slope(), **FAST | {"seed": seed}, **options, trajectories_per_iteration=6)
+    asked, rng = [], np.random.default_rng(seed)
+    while questions := learner.ask():
+        asked.append({questions[0].first, questions[0].second})
+        skipped = skips and rng.random() < 0.6
+        learner.tell(["skip" if skipped else ReturnExpert()(*questions[0].trajectories)])
+    assert len(asked) >= 8
+    assert all(pair not in asked[:place] for place, pair in enumerate(asked))
+
+
 def test_the_two_of_a_question_start_alike(run):
     log = [line for line in (run.path / "events.jsonl").read_text().splitlines() if '"asked"' in line]
     assert len(log) == 4

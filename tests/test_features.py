@@ -138,6 +138,7 @@ def test_a_constant_feature_has_the_variance_of_the_others_where_lengths_differ(
         return Trajectory(rng.normal(size=(length + 1, 2)), np.zeros((length, 1)), np.zeros(length), terminated)
 
     assert source.of_states([walk(30, False)] * 2, options, rng=rng).constant == 0
+    assert source.of_states([walk(30, False), walk(12, False)], options, rng=rng).constant > 0  # cut early
     features = source.of_states([walk(30, False), walk(12, True)], options, rng=rng)
     others = replace(features, constant=0.0)
     columns = features.rescaled(3.0)(walk(30, False).states)

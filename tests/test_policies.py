@@ -344,6 +344,13 @@ def test_an_infinite_bound_counts_as_the_unit_interval():
     np.testing.assert_array_equal(width, [2.0, 3.0])
 
 
+def test_where_one_bound_is_infinite_the_centre_is_beside_the_other():
+    space = Box(np.array([3.0, -np.inf]), np.array([np.inf, -8.0]), dtype=float)
+    centre, width = centre_and_range("action_space", space)
+    np.testing.assert_array_equal(centre, [4.0, -9.0])
+    np.testing.assert_array_equal(width, [2.0, 2.0])
+
+
 def test_the_tabular_fit_is_the_share_of_the_weight_and_keeps_unvisited_rows():
     policy = TabularPolicy(np.array([[0.5, 0.5], [0.25, 0.75], [0.1, 0.9]]))
     new = policy.fit(np.array([0, 0, 0, 2]), np.array([0, 1, 1, 1]), np.array([1.0, 2.0, 1.0, 5.0]))

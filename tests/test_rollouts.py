@@ -245,6 +245,14 @@ def test_an_explicit_limit_overrides_the_environments_own():
     assert len(rollout("Pendulum-v1", pole, key=KEY, episodes=2, max_steps=210)[1]) == 210  # its own: 200
 
 
+def test_of_several_limits_the_least_holds():
+    for limits in ((3, 9), (9, 3)):
+        env = gymnasium.make("bayespbrl/Gridworld-v0").unwrapped
+        for limit in limits:
+            env = gymnasium.wrappers.TimeLimit(env, limit)
+        assert len(rollout(env, UNIFORM_TABLE, key=KEY, episodes=1)[0]) == 3
+
+
 def test_users_wrappers_are_not_bypassed():
     env = gymnasium.wrappers.TransformReward(gymnasium.make("bayespbrl/Gridworld-v0"), lambda reward: -reward)
     trajectory = rollout(env, UNIFORM_TABLE, key=KEY, episodes=1, max_steps=20)[0]
@@ -359,6 +367,21 @@ def test_a_users_pure_functions_run_compiled():
     np.testing.assert_array_equal(trajectory.states, np.arange(7.0)[:, None])
     assert trajectory.total_reward == 21
     assert trajectory.terminated
+
+
+class FromWhole(Drifting):
+    """Starts at a whole number, and moves by a half."""
+
+    def initial(self, rng, params=None):
+        return jnp.zeros(1, int)
+
+    def transition(self, state, action, rng, params=None):
+        return state + 0.5
+
+
+def test_pure_functions_may_start_with_other_types_than_they_go_on_with():
+    trajectory = rollout(FromWhole({"bad": ""}), Coin(np.array(0.5)), key=KEY, episodes=1, max_steps=3)[0]
+    np.testing.assert_array_equal(trajectory.states[:, 0], [0, 0.5, 1, 1.5])
 
 
 @pytest.mark.parametrize(("bad", "step"), [("observation", 3), ("reward", 4)])

@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete
 
 import bayespbrl
 from bayespbrl import ReturnExpert, UtilityReward
@@ -51,6 +52,36 @@ def test_caution_subtracts_standard_deviations(pendulum):
     assert less == pytest.approx(more - 2 * info["utility_deviation"])
     with pytest.raises(ValueError, match="caution: expected finite"):
         UtilityReward(gymnasium.make("Pendulum-v1"), pendulum, caution=float("nan"))
+
+
+class Picture(gymnasium.Env):
+    """Four pixels that brighten by the action."""
+
+    observation_space = Box(0, 255, (2, 2), np.uint8)
+    action_space = Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.full((2, 2), 200, np.uint8)
+        return self.state, {}
+
+    def step(self, action):
+        self.state = np.minimum(self.state, 250) + np.uint8(action)
+        return self.state, float(action), False, False, {}
+
+
+def brightness(states):
+    return states[:, :1] * 2 + 100  # 8 bits would overflow
+
+
+def test_features_of_small_integers_are_those_that_the_learner_had(tmp_path):
+    options = FAST | {"max_steps": 4, "features": brightness}
+    bayespbrl.start(Picture(), tmp_path / "run", **options).run(ReturnExpert())
+    run = bayespbrl.load(tmp_path / "run", env=Picture(), features=brightness)
+    wrapped = UtilityReward(Picture(), run)
+    wrapped.reset(seed=0)
+    observation, reward, *_ = wrapped.step(1)
+    assert reward == pytest.approx(run.estimate.utilities(observation.reshape(1, -1).astype(float))[0])
 
 
 def test_a_discrete_task_of_ours_earns_utility_too(gridworld_run):

@@ -74,8 +74,14 @@ class WhitenedFeatures:
     mapping: Float[np.ndarray, "d r"]
 
 
-def whitened(state_features: Float[np.ndarray, "n d"], base_weights: PerSample) -> WhitenedFeatures:
+def whitened(
+    state_features: Float[np.ndarray, "n d"], base_weights: PerSample, *, most: int | None = None
+) -> WhitenedFeatures:
     """Features whitened under W, without directions below `RANK_TOLERANCE` of the largest singular value.
+
+    Args:
+      state_features, base_weights: as in `reps_weights`.
+      most: of the directions that are kept, those of the largest singular values; None: all.
 
     Raises:
       ValueError: entries that are not finite.
@@ -87,7 +93,8 @@ def whitened(state_features: Float[np.ndarray, "n d"], base_weights: PerSample) 
     keep = values > max(values[-1], 0.0) * RANK_TOLERANCE**2
     if not np.any(keep) or values[-1] <= 1e-24:
         return WhitenedFeatures(np.zeros((len(centred), 0)), np.zeros((centred.shape[1], 0)))
-    mapping = vectors[:, keep] / np.sqrt(values[keep])
+    leading = slice(None if most is None else -most, None)  # the eigenvalues ascend
+    mapping = (vectors[:, keep] / np.sqrt(values[keep]))[:, leading]
     return WhitenedFeatures(centred @ mapping, mapping)
 
 

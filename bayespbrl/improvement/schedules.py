@@ -117,7 +117,7 @@ class ConfidenceBound:
             signal *= square / total if total > 0 and np.mean(gains) > 0 else 0.0
             statistics["agreement"] = float(np.mean(gains > 0))
             reason = f"{statistics['agreement']:.0%} of the draws expect a gain, {reason}"
-        bound = max(LEAST_BOUND, signal**2 * self.largest)  # KL grows with s²
+        bound = min(self.largest, max(LEAST_BOUND, signal**2 * self.largest))  # KL grows with s²
         reason = f"{reason}; signal {signal:.2f}"
         if not quality.converged and bound > usual:
             return Bound(usual, f"{reason}; not converged: at most the run's own bound", signal, statistics)

@@ -29,6 +29,7 @@ from bayespbrl.policies.policy import ContinuousPolicy, DiscretePolicy, fit_conv
 
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
 NOTHING = 1e-3  # of the bound; weights that have moved by less have nothing to gain
+MOST_CONSTRAINED = 0.25  # features of the constraint on the state distribution, of the samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +63,15 @@ class ProposedUpdate:
 
     @cached_property
     def constraint(self) -> WhitenedFeatures | Int[np.ndarray, " n"]:
-        """The whitened features, which every bound shares; or the states' numbers."""
+        """The whitened features, which every bound shares; or the states' numbers.
+
+        Decision: sampled actions differ between samples only as their states do. As many constraints as samples would
+        leave no weights but the present ones, so there are at most `MOST_CONSTRAINED` as many.
+        """
         if self.state_features.ndim == 1:
             return self.state_features
-        return whitened(self.state_features, self.base_weights)
+        most = None if is_discrete(self.policy) else max(1, int(MOST_CONSTRAINED * len(self.base_weights)))
+        return whitened(self.state_features, self.base_weights, most=most)
 
     def solve(self, kl_bound: float) -> RepsSolution:
         """REPS for the mean Q at this bound (eqs. 11-13); each bound is solved once."""
@@ -122,7 +128,7 @@ class Improvement:
       policy: the new policy.
       q_function: Q that the last update follows, under the policy before it.
       reps: of the last update: sample weights, temperature, KL and its bound, feature gaps, rank, effective samples.
-      updates: how many there were.
+      updates: how many there were; 0 where REPS had nothing to gain, or failed.
       kl_fitted_policy: mean KL of the new policy from the old one over the states of the updates, nats.
       entropy: mean entropy of the new policy over the same states, nats.
       action_standard_deviation: mean of the new policy's over the same states, one number per action dimension, in the
@@ -224,26 +230,30 @@ def apply_update(
       updates: most of them. Another follows while the policy has moved by less than `NEARLY` of the bound and REPS
         finds a gain: a policy that smooths over its samples follows their weights only part of the way. All but the
         first hold the spread of a policy with `fit_mean`, which would otherwise narrow before the utility is known.
+        Where REPS finds nothing or fails, the policy stays as it is: a fit to its own samples would narrow it.
 
     Source: paper, eqs. 11-14.
     """
     policy, (states, visits) = proposed.policy, proposed.problem.visited
-    improved = policy
-    for number in range(checks.whole("updates", updates)):
+    improved, number, moved = policy, 0, 0.0
+    while number < checks.whole("updates", updates):
         if number:
             proposed = propose(improved, proposed.problem, key=jax.random.fold_in(key, number))
         reps = proposed.solve(kl_bound)
+        if reps.kl < NOTHING * kl_bound or not reps.converged:
+            break
         fit = getattr(improved, "fit_mean" if number and hasattr(type(improved), "fit_mean") else "fit")
         improved = fit(*proposed.samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)  # eq. 14
         moved = float(visits @ improved.kl_divergence(policy, states))
-        if moved >= NEARLY * kl_bound or reps.kl < NOTHING * kl_bound or not reps.converged:
+        number += 1
+        if moved >= NEARLY * kl_bound:
             break
     weights = proposed.q_functions.weights
     return Improvement(
         policy=improved,
         q_function=replace(proposed.q_functions, weights=weights.reshape(len(weights), -1)[:, 0]),
         reps=reps,
-        updates=number + 1,
+        updates=number,
         kl_fitted_policy=moved,
         entropy=float(visits @ entropies(improved, states)),
         action_standard_deviation=None

@@ -24,12 +24,18 @@ def dimension(name: str, space: Space[Any]) -> int:
 
 
 def centre_and_range(name: str, space: Space[Any]) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " a"]]:
-    """(low + high)/2 and high − low of a `Box`, per dimension; 0 and 2, as for [−1, 1], where a bound is infinite."""
+    """(low + high)/2 and high − low of a `Box`, per dimension.
+
+    Where both bounds are infinite 0 and 2, as for [−1, 1]; where one is, the range is the 2 next to the other.
+    """
     if not isinstance(space, Box):
         raise ValueError(f"{name}: expected a Box, got {space}")
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    bounded = np.isfinite(low) & np.isfinite(high)
-    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    above, below = np.isfinite(low), np.isfinite(high)  # that there is a bound
+    low, high = (
+        np.where(above, low, np.where(below, high - 2.0, -1.0)),
+        np.where(below, high, np.where(above, low + 2.0, 1.0)),
+    )
     if not np.all(high > low):
         raise ValueError(f"{name}: expected low < high in every dimension, got {space}")
     return (low + high) / 2, high - low

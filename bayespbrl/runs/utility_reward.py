@@ -56,6 +56,7 @@ class UtilityReward(gymnasium.Wrapper):
         return observation, utility - self.caution * deviation, terminated, truncated, info
 
     def _utility(self, states: np.ndarray) -> tuple[float, float]:
+        states = states.astype(np.float64) if states.ndim > 1 else states  # as the learner saw them
         if self._thinned.posterior is None:
             return float(self._thinned.utilities(states)[0]), 0.0
         mean, draws = self._thinned.utilities_and_draws(states)

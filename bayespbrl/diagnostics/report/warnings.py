@@ -17,6 +17,8 @@ from bayespbrl.preferences import Answer
 # three nats a dimension when its standard deviation is a twentieth of the first.
 ENTROPY_LEFT, ENTROPY_LOST = 0.1, 3.0
 SURPRISING = 0.1
+# The confidence of the default schedule sets its own bounds.
+SMALLER = "smaller updates (--schedule constant with a small --kl-bound)"
 
 
 def find_warnings(
@@ -62,7 +64,7 @@ def _of_updates(table: xr.Dataset) -> Iterator[ReportWarning]:
     if failed.any():
         yield ReportWarning(
             f"REPS did not converge in {_which(iteration[failed])}: that update changed nothing.",
-            "Fewer centres (--centres) or a smaller --kl-bound makes the dual easier to solve.",
+            f"Fewer centres (--centres) or {SMALLER} make the dual easier to solve.",
         )
     if (idle := iteration[(table["bound_active"].values == 0) & ~failed]).size:
         yield ReportWarning(
@@ -79,8 +81,8 @@ def _of_fitted_policy(table: xr.Dataset) -> Iterator[ReportWarning]:
         yield ReportWarning(
             f"The fit of the policy did not converge in {_which(failed)}: the policy may not follow the weights of "
             "REPS there.",
-            "Compare the fitted policy's KL with the KL that REPS reached. Harmless where they agree. Otherwise try a "
-            "smaller --kl-bound or another kind of policy (--policy).",
+            "Compare the fitted policy's KL with the KL that REPS reached. Harmless where they agree. Otherwise try "
+            f"{SMALLER} or another kind of policy (--policy).",
         )
     # of several updates the policy's KL is that of all together, and REPS' own that of the last alone
     several = table["updates"].values > 1
@@ -88,12 +90,12 @@ def _of_fitted_policy(table: xr.Dataset) -> Iterator[ReportWarning]:
     if (far := iteration[fitted > 3 * np.maximum(reached, 0.01)]).size:
         yield ReportWarning(
             f"The fitted policy moved more than three times as far as REPS asked for in {_which(far)}.",
-            "The bound does not hold there. Try another kind of policy (--policy) or a smaller --kl-bound.",
+            f"The bound does not hold there. Try another kind of policy (--policy) or {SMALLER}.",
         )
     if (near := iteration[(fitted < reached / 3) & (reached > 0.02)]).size > 0.2 * len(iteration):
         yield ReportWarning(
             f"The fitted policy moved less than a third as far as REPS asked for in {_which(near)}.",
-            "The policy smooths the update. Harmless while the value rises. A larger --kl-bound moves it further"
+            "The policy smooths the update. Harmless while the value rises. A larger bound moves it further"
             + (", and so do more updates (--updates-per-iteration 3)." if not several.any() else "."),
         )
 
@@ -109,8 +111,8 @@ def _of_entropy(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarn
     if collapsed:
         yield ReportWarning(
             f"The policy's entropy collapsed, from {first:.2f} to {last:.2f} nats: it hardly explores.",
-            "Harmless if the value is good. Otherwise the policy settled too early: a smaller --kl-bound narrows it "
-            "more slowly. A run with another --seed shows whether this was chance.",
+            f"Harmless if the value is good. Otherwise the policy settled too early: {SMALLER} narrow it more slowly. "
+            "A run with another --seed shows whether this was chance.",
         )
 
 
@@ -120,7 +122,7 @@ def _of_value(table: xr.Dataset) -> Iterator[ReportWarning]:
         best = int(np.argmax(value))
         yield ReportWarning(
             f"The value has fallen from {number(value[best])} (iteration {best + 1}) to {number(value[-1])}.",
-            "Either the evaluation is noisy, an update was too large (look at the KL, and try a smaller --kl-bound), "
+            f"Either the evaluation is noisy, an update was too large (look at the KL, and try {SMALLER}), "
             "or no answer covers this policy, and the posterior is wrong about it: more answers help.",
         )
 
