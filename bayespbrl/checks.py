@@ -6,11 +6,20 @@ from typing import Any
 
 import numpy as np
 
+MOST_SEED = 2**63 - 1
+
 
 def whole(name: str, value: Any, least: int = 1) -> int:
     """`value` as an int, where it is a whole number >= `least`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}: expected a whole number >= {least}, got {value!r}")
+    return int(value)
+
+
+def seed(value: Any) -> int:
+    """A seed as an int, where it is a whole number that a run can keep."""
+    if whole("seed", value, 0) > MOST_SEED:
+        raise ValueError(f"seed: expected at most {MOST_SEED}, got {value}")
     return int(value)
 
 
@@ -104,7 +113,7 @@ def index(name: str, value: Any, number: int) -> int:
 
 def flags(name: str, values: Any, number: int) -> np.ndarray:
     """`values` as an array, where it is bool of shape (`number`,)."""
-    array = np.asarray(values)
+    array = np.asarray(values, dtype=None if np.size(values) else bool)  # an empty list has no type
     if array.shape != (number,) or array.dtype != bool:
         raise ValueError(f"{name}: expected bool of shape ({number},), got {array.dtype} of shape {array.shape}")
     return array

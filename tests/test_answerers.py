@@ -26,7 +26,7 @@ from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.diagnostics.report.people import people_warnings
 from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.events import Entry, LearnerState, apply
-from bayespbrl.models import PreferenceModel, sample_posterior
+from bayespbrl.models import Answers, PreferenceModel, posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import utility_margins
 from bayespbrl.preferences import PastQuestion, Source
 from bayespbrl.questions import LEAST_BETWEEN
@@ -157,6 +157,11 @@ def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
     assert (checked.answerers.tolist(), checked.names) == ([0, 1, 0], ("Bob", "Ada"))
     one = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob"] * 3)
     assert one.answers == Comparisons.among(trajectories, pairs, discount=1.0).answers
+
+
+def test_names_without_who_gave_which_answer_are_refused():
+    with pytest.raises(ValueError, match="answerers: expected who of Ada gave each answer, got None"):
+        posterior_draws(np.ones((2, 1)), PreferenceModel(), seed=0, answers=Answers(names=("Ada",)))
 
 
 def test_nobody_has_answered_a_new_run_and_an_answer_without_a_name_is_somebodys():

@@ -20,6 +20,7 @@ from bayespbrl.models import (
 )
 from bayespbrl.models.chains import CHUNK, KERNEL, Chains, _ellipses, draw_chunk
 from bayespbrl.models.convergence import Convergence, chain_convergence
+from bayespbrl.models.evidence import _bridged
 from bayespbrl.models.gibbs import conditional
 from bayespbrl.models.likelihoods import Mixed, log_prob
 from bayespbrl.models.low_rank import low_rank
@@ -67,6 +68,30 @@ def test_answers_that_contradict_each_other_about_the_same_margin_are_sampled_ex
     assert tree.attrs["converged"]
     error = chain_convergence(margins).monte_carlo_error
     assert np.all(np.abs(margins.mean(axis=(0, 1)) - differences @ mean) < 4 * error)
+
+
+def test_answers_that_contradict_each_other_without_lapses_have_chains_that_start_apart_and_their_evidence():
+    rng = np.random.default_rng(0)
+    differences = rng.normal(size=(30, 2))
+    differences *= np.sign(differences @ [1, 0.5] + 0.7 * rng.normal(size=30))[:, None]
+    fit = fit_gaussian(differences, PreferenceModel())
+    tree = sample_posterior(differences, seed=1)
+    drawn = tree["posterior/coordinates"].values
+    assert np.all(np.sqrt(np.diag(fit.approximation.covariance)) > 0.3 * drawn.std(axis=(0, 1)))
+    grid = np.linspace(-5, 5, 1201) + 0.004  # not at zero, where all margins are
+    w = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+    with jax.enable_x64(True):
+        log_p = np.asarray(log_prob(Mixed(5.0, 30.0), w @ differences.T)).sum(axis=1)
+    log_p += np.sum(stats.norm.logpdf(w), axis=1) + 2 * np.log(grid[1] - grid[0])
+    assert abs(tree.attrs["log_evidence"] - logsumexp(log_p)) < 4 * tree.attrs["log_evidence_error"]
+    assert tree.attrs["log_evidence_error"] < 0.3
+
+
+def test_the_error_of_an_evidence_without_overlap_is_infinite():
+    rng = np.random.default_rng(0)
+    near, far = _bridged(rng.normal(0.5, 1, 1000), rng.normal(-0.5, 1, 1000), 1.0), rng.normal(-40, 9, 1000)
+    assert near[0] == pytest.approx(0, abs=4 * near[1])  # normal log ratios whose means differ by their variance
+    assert _bridged(rng.normal(40, 9, 1000), far, 1.0)[1] == np.inf
 
 
 def test_no_preferences_give_the_prior():
@@ -356,6 +381,9 @@ def test_the_posterior_finds_the_length_scale_that_ordered_the_pairs():
         ({"num_samples": 0}, "num_samples: expected"),
         ({"max_samples": 10, "num_samples": 20}, "max_samples: expected"),
         ({"seed": -1}, "seed: expected"),
+        ({"seed": 2**63}, "seed: expected at most"),
+        ({"number_of_preferences": -3}, "number_of_preferences: expected a whole number >= 0"),
+        ({"number_of_preferences": 2.5}, "number_of_preferences: expected a whole number >= 0"),
         ({"shown_first": np.array([2, 0])}, "shown_first: expected 2 whole numbers in -1 … 1"),
         ({"answerers": np.array([0])}, "answerers: expected 2 whole numbers"),
         ({"differences": np.ones((0, 2, 3))}, "differences: expected shape"),

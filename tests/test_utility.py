@@ -211,6 +211,19 @@ def test_each_draw_is_of_the_features_of_its_own_setting(walked):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("scale", [1e200, 1e-200])
+def test_features_of_any_scale_count(scale):
+    sums = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.25]])
+    plain, scaled = (infer_utility(factor * sums, [(0, 1), (2, 1)]) for factor in (1.0, scale))
+    np.testing.assert_allclose(scaled.weights * scale, plain.weights, rtol=1e-6)
+    assert np.all(plain.weights != 0)
+
+
+def test_nobody_and_no_tie_among_no_answers_may_be_empty_lists():
+    none = infer_utility(np.eye(2), [], answerers=[], shown_first=[], ties=[])
+    assert np.all(none.weights == 0)
+
+
 def test_a_setting_of_a_very_different_scale_counts_by_its_probability_alone():
     # the features of the second setting are those of the first, times 1000: nothing can tell the settings apart
     one = inference.estimate(

@@ -1,7 +1,7 @@
 """Power-scaling sensitivity of the posterior to the prior scale σ and to the likelihood.
 
-The normalised power α of the prior N(0, σ²I) is N(0, σ²I/α), so that power-scaling the prior changes σ to σ/√α. The
-likelihood to the power α counts every answer α times.
+The normalised power α of the prior N(0, σ²I) is N(0, σ²I/α), so that power-scaling the prior changes σ to σ/√α, and the
+scale of the side biases alike where these are inferred. The likelihood to the power α counts every answer α times.
 """
 
 import numpy as np

@@ -67,7 +67,8 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: An
         for column, side in ((PREFERRED, 1.0), (DOMINATED, -1.0)):
             probabilities[:, column] += smoothed_probability(likelihood, side * margins, spread).sum(axis=0)
     probabilities /= len(draws["setting"])
-    probabilities[:, TIED] = 1 - probabilities[:, :TIED].sum(axis=1) if "tie_threshold" in draws else 0.0
+    left = np.maximum(1 - probabilities[:, :TIED].sum(axis=1), 0.0)  # rounding may take a little too much
+    probabilities[:, TIED] = left if "tie_threshold" in draws else 0.0
     return probabilities
 
 

@@ -17,18 +17,23 @@ from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.gibbs import JointProblem, Unknowns, conditional, log_likelihood, prior_draws, reference_scale
 
 NUMBER = 1000  # draws of each sample
-ITERATIONS = 30  # the fixed point converges geometrically
+LEAST_OVERLAP = 5.0  # effective draws of each sample that are as the other's; with fewer the error is not known
+TOLERANCE, ITERATIONS = 1e-9, 1000  # nats; the fixed point converges geometrically, fast where the two samples overlap
 
 
 def log_evidence(chains: Chains, length: int, *, seed: int) -> tuple[float, float]:
     """Log marginal likelihood in nats, and its standard error, from the first `length` draws of each chain.
+
+    The error is infinite where hardly any of the posterior's draws are as those of the proposal.
 
     Source: Meng & Wong (1996), eqs. 2.3 and 4.1; the error is that of the two means of the last iteration.
     """
     if chains.number == 0:
         return 0.0, 0.0
     z = chains.collected("coordinates", length)
-    each = np.linspace(0, length - 1, NUMBER // z.shape[0]).round().astype(int)  # as many, however long the chains are
+    each = (
+        np.linspace(0, length - 1, max(4, NUMBER // z.shape[0])).round().astype(int)
+    )  # as many, however long the chains are
     rank, rng = chains.problem.settings.centre.shape[1], np.random.default_rng([seed, 3])
     scale = float(chains.problem.settings.prior_scale)
     padding = scale * rng.standard_normal((z.shape[0], len(each), rank - z.shape[2]))
@@ -52,13 +57,19 @@ def _bridged(
     effective, number = relative * len(posterior), len(proposal)
     log_share, log_rest = np.log([effective / (effective + number), number / (effective + number)])
     estimate = 0.0 if np.all(proposal == -np.inf) else float(logsumexp(proposal) - np.log(number))
+    last = np.inf
     for _ in range(ITERATIONS):  # Meng & Wong (1996), eq. 4.1, in logarithms
+        if abs(estimate - last) < TOLERANCE:
+            break
+        last = estimate
         above = proposal - np.logaddexp(log_share + proposal, log_rest + estimate)
         below = -np.logaddexp(log_share + posterior, log_rest + estimate)
         estimate = float(logsumexp(above) - np.log(len(proposal)) - logsumexp(below) + np.log(len(posterior)))
+    above, below = np.exp(above - above.max()), np.exp(below - below.max())
+    if min(each.sum() ** 2 / np.sum(each**2) for each in (above, below)) < LEAST_OVERLAP:
+        return estimate, float("inf")
     errors = [  # of the two means of Meng & Wong (1996), eq. 2.3, by the delta method
-        np.var(values) / np.mean(values) ** 2 / size
-        for values, size in ((np.exp(above - above.max()), number), (np.exp(below - below.max()), effective))
+        np.var(values) / np.mean(values) ** 2 / size for values, size in ((above, number), (below, effective))
     ]
     return estimate, float(np.sqrt(sum(errors)))
 

@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike
 from bayespbrl import checks
 from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
-from bayespbrl.models.likelihoods import Likelihood, prob
+from bayespbrl.models.likelihoods import Likelihood, WithLapses, has_steps, prob, ties_of
 from bayespbrl.models.low_rank import LowRank, low_rank, used_rows
 from bayespbrl.models.preference_model import PreferenceModel
+
+NOW_AND_THEN = 0.05  # lapse rate of the Gaussian where answers without lapses contradict each other
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,8 @@ def refitted(
 
     `widening` is for many answers: the factor of a violated answer may widen the Gaussian, where that converges.
     """
+    if tied is None and model.tie_threshold is not None:
+        tied = np.zeros(len(fit.differences), dtype=bool)
     likelihood = model.answer_likelihood(number_of_preferences, tied)
     with one_blas_thread():
         approximation = None
@@ -93,6 +97,22 @@ def refitted(
 def _approximation(
     factors: LowRank, likelihood: Likelihood, prior_scale: float, *, widening: bool = False
 ) -> GaussianApproximation:
+    """Expectation propagation's Gaussian.
+
+    Decision: where answers contradict each other and nobody lapses, each is a step that squeezes the Gaussian between
+    them, until it is a thousandth as wide as the posterior: chains would all start at one point. It is then that of
+    answerers who lapse now and then.
+    """
     used = used_rows(factors.loadings)
-    mixture = likelihood.probit_mixture().of(used)
-    return expectation_propagation(factors.loadings[used], mixture, prior_scale=prior_scale, widening=widening)
+    loadings = factors.loadings[used]
+
+    def fitted(answers: Likelihood) -> GaussianApproximation:
+        mixture = answers.probit_mixture().of(used)
+        return expectation_propagation(loadings, mixture, prior_scale=prior_scale, widening=widening)
+
+    fit, ties = fitted(likelihood), ties_of(likelihood)
+    ordered = np.ones(len(loadings), dtype=bool) if ties is None else ~np.asarray(ties.indifferent)[used]
+    lapse = isinstance(likelihood, WithLapses) or not has_steps(likelihood)
+    if lapse or np.all(loadings[ordered] @ fit.mean >= 0):
+        return fit
+    return replace(fitted(WithLapses(likelihood, NOW_AND_THEN)), log_evidence=fit.log_evidence)

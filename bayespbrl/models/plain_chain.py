@@ -55,7 +55,7 @@ def plain_draws(
     Raises:
       ValueError: several settings of the features; a model that leaves something to be inferred.
     """
-    draws, seed = checks.whole("draws", draws, LEAST), checks.whole("seed", seed, 0)
+    draws, seed = checks.whole("draws", draws, LEAST), checks.seed(seed)
     settings = settings_of(differences)
     if len(settings) > 1 or model.steepness is None or model.lapse_rate is None:
         raise ValueError(

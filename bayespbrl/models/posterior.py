@@ -98,7 +98,8 @@ def sample_posterior(
       at the root: utility_weights_mean (feature), whose part outside the differences' row space is exactly zero;
         utility_weights_most_likely (feature), the draw of highest likelihood with the rest at its mean, zero (both with
         a dimension `setting` in front where there is one: each setting's part of the sum); and the attributes
-        log_evidence and log_evidence_error (by bridge sampling), rhat_max, effective_sample_size_min, converged, stuck,
+        log_evidence and log_evidence_error (by bridge sampling; infinite where that cannot be told), rhat_max,
+        effective_sample_size_min, converged, stuck,
         prior_scale, steepness, lapse_rate, likelihood, number_of_preferences, tie_threshold (NaN: inferred), seed.
       `stored(tree).to_netcdf(path)` writes it without the utility weights; `restored` brings them back.
 
@@ -125,11 +126,13 @@ def posterior_draws(
     sampler: SamplerOptions | None = None,
 ) -> xr.DataTree:
     """`sample_posterior` with its options in objects; `sampler` None for the default `SamplerOptions`."""
-    seed = checks.whole("seed", seed, 0)
+    seed = checks.seed(seed)
     sampler = SamplerOptions() if sampler is None else sampler
     settings = settings_of(differences)
     answers = answers.checked(settings.shape[1])
-    number = settings.shape[1] if number_of_preferences is None else number_of_preferences
+    number = settings.shape[1]
+    if number_of_preferences is not None:
+        number = checks.whole("number_of_preferences", number_of_preferences, 0)
     fits = [
         fit_gaussian(each, model, indifferent=answers.indifferent, number_of_preferences=number)
         for each in answers.with_sides(settings, model.prior_scale)

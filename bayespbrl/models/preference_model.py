@@ -104,6 +104,8 @@ class Answers:
         tied, sides, who, names = self.indifferent, self.shown_first, self.answerers, self.names
         if who is not None:
             who, names = _numbered(np.asarray(who), names, number)
+        elif names is not None and number:
+            raise ValueError(f"answerers: expected who of {', '.join(names)} gave each answer, got None")
         return Answers(
             None if tied is None else checks.flags("indifferent", tied, number),
             None if sides is None else _numbers("shown_first", sides, number, -1, 1),
@@ -157,6 +159,7 @@ def _numbered(
 
 def _numbers(name: str, values: ArrayLike, number: int, least: int, most: int) -> Integer[np.ndarray, " k"]:
     array = np.asarray(values)
+    array = array.astype(int) if array.shape == (0,) else array  # an empty list has no type
     if array.shape != (number,) or array.dtype.kind not in "iu" or np.any((array < least) | (array > most)):
         raise ValueError(f"{name}: expected {number} whole numbers in {least} … {most}, got {values!r}")
     return array

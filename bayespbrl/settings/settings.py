@@ -143,9 +143,7 @@ class Settings:
     questions: Questions = field(default_factory=Questions)
 
     def __post_init__(self) -> None:
-        checks.whole("seed", self.seed, 0)
-        if self.seed > MOST_SEED:
-            raise ValueError(f"seed: expected at most {MOST_SEED}, got {self.seed}")
+        checks.seed(self.seed)
         checks.one_of("preset", self.preset, presets.NAMES)
         if self.iterations is not None:
             checks.whole("iterations", self.iterations)
@@ -259,7 +257,6 @@ PARTS: dict[str, type[Any]] = {
     "rollouts": Rollouts,
     "questions": Questions,
 }
-MOST_SEED = 2**63 - 1
 # The part that reads each option; "" for the run's own. The tie threshold has none: a run infers it.
 OPTIONS: dict[str, str] = {f.name: "" for f in fields(Settings) if f.name not in ("env", *PARTS)} | {
     option.name: part for part, kind in PARTS.items() for option in fields(kind) if option.name != "tie_threshold"

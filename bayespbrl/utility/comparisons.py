@@ -86,6 +86,10 @@ def normalised(differences: Float[np.ndarray, "k d"]) -> tuple[Float[np.ndarray,
     the features, so that a setting counts in a mean of utilities by its probability alone; and steepness, tie threshold
     and side bias mean the same under each.
     """
+    largest = float(np.max(np.abs(differences), initial=0.0))
+    if largest and not 1e-150 < largest < 1e150:  # its square is no number
+        scaled, scale = normalised(differences / largest)
+        return scaled, scale * largest
     scale = float(np.sqrt(np.mean(np.sum(differences**2, axis=1)))) if len(differences) else 1.0
     scale = scale or 1.0
     return differences / scale, scale

@@ -123,7 +123,7 @@ def infer_utility(
         argument that is not as above, whether the method uses it or not.
     """
     checks.one_of("method", method, (*POSTERIOR_METHODS, "linear-program"))
-    checks.whole("seed", seed, 0)
+    checks.seed(seed)
     sums = checks.matrix("feature_sums", feature_sums)
     every = np.concatenate([checks.pairs("pairs", pairs), checks.pairs("ties", ties)])
     tied = np.arange(len(every)) >= len(pairs)
