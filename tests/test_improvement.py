@@ -1,11 +1,19 @@
 """Step 2: on a small discrete problem with a known model, and once with continuous actions."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from bayespbrl.features import OneHot, RadialBasisOptions, StateActionProduct, draw_state_action_features
+from bayespbrl.features import (
+    OneHot,
+    RadialBasisOptions,
+    StateActionProduct,
+    checked_features,
+    draw_state_action_features,
+)
 from bayespbrl.improvement import q_function, update
 from bayespbrl.improvement.problem import PolicyUpdate, UpdateProblem, recent
 from bayespbrl.improvement.q_function import Critic
@@ -409,6 +417,20 @@ def test_where_reps_finds_nothing_the_policy_stays_as_it_is_and_does_not_narrow(
     updated = improve(policy, steps, np.full(len(steps), 2.5), updates=3, **options)
     assert updated.policy is policy
     assert (updated.updates, updated.kl_fitted_policy, updated.reps.bound_active) == (0, 0.0, False)
+
+
+def test_features_of_the_users_own_constrain_the_states_alike_in_any_units():
+    policy, steps, options = few_samples()
+
+    def features_in(unit):
+        return partial(checked_features, lambda s: s * [1.0, unit])
+
+    plain, mixed = (
+        improve(policy, steps, steps.actions[:, 0], **options | {"state_features": features_in(unit)})
+        for unit in (1.0, 1e5)
+    )
+    assert plain.reps.rank_kept == mixed.reps.rank_kept == 2
+    np.testing.assert_allclose(mixed.reps.probabilities, plain.reps.probabilities, rtol=1e-4)
 
 
 def test_few_sampled_actions_leave_the_weights_some_freedom():

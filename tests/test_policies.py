@@ -331,6 +331,20 @@ def test_spaces_that_do_not_suit_are_named(policy_class, observations, actions, 
         policy_class.initial(observations, actions)
 
 
+def test_a_linear_fit_to_few_samples_holds_the_noise_and_stays_near_the_old_mean():
+    rng = np.random.default_rng(0)
+    wide = Box(-1, 1, (48,), np.float64)
+    states = rng.normal(size=(400, 48))
+    policy = LinearGaussianPolicy.initial(wide, TORQUE)
+    many = policy.fit(states, np.sin(states[:, :1]) + rng.normal(size=(400, 1)), np.ones(400))
+    drawn = sample_actions(many, jax.random.key(0), states[:40])
+    few = many.fit(states[:40], drawn, np.ones(40))
+    np.testing.assert_array_equal(few.factor, many.factor)
+    assert np.mean(few.kl_divergence(many, states[:40])) < 0.3  # interpolated it would be 0.5
+    towards = many.fit(states[:40], many._means(states[:40]), np.ones(40))
+    np.testing.assert_allclose(towards._means(states), many._means(states), atol=1e-9)
+
+
 def test_no_observation_is_refused():
     with pytest.raises(ValueError, match="at least one row"):
         sample_actions(initial("tabular"), jax.random.key(0), np.zeros(0, int))

@@ -116,7 +116,8 @@ class LinearGaussianPolicy:
         """Weighted least squares for the mean, the weighted covariance of its residuals for the noise (eq. 14).
 
         With actions divided by their range, no eigenvalue of Σ falls below minimum_noise²: the maximum likelihood under
-        that bound.
+        that bound. Samples that are not twice as many as the coefficients of an action could be met by any noise: the
+        noise is then held, and the mean drawn to that of the old policy, as if by as many samples as there are slopes.
 
         Args:
           observations, actions: sᵢ (N, S) and unclipped aᵢ (N, A).
@@ -130,10 +131,17 @@ class LinearGaussianPolicy:
         location, deviation = location_and_deviation(samples.observations, shares)
         scale = np.where(deviation > 0, deviation, 1.0)  # a constant dimension keeps a slope of zero
         standardised = (samples.observations - location) / scale
-        centre = shares @ samples.actions  # eq. 14
-        weighted = standardised * shares[:, None]
-        gram = weighted.T @ standardised + RIDGE * np.eye(dimensions)
-        slopes = np.linalg.solve(gram, weighted.T @ (samples.actions - centre)).T  # eq. 14
+        weighted, effective = standardised * shares[:, None], 1 / np.sum(shares**2)
+        few = effective < 2 * (dimensions + 1)
+        old = self._means(samples.observations) if few else np.zeros_like(samples.actions)
+        centre = shares @ (samples.actions - old)  # eq. 14
+        gram = weighted.T @ standardised + (dimensions / effective if few else RIDGE) * np.eye(dimensions)
+        slopes = np.linalg.solve(gram, weighted.T @ (samples.actions - old - centre)).T  # eq. 14
+        if few:
+            slopes += np.asarray(self.coefficients)[:, 1:] / np.asarray(self.scale) * scale
+            centre += self._means(location[None])[0]
+            held = {"coefficients": np.column_stack([centre, slopes]), "location": location, "scale": scale}
+            return replace(self, **held)
         residuals = (samples.actions - centre - standardised @ slopes.T) / self.action_range
         values, vectors = np.linalg.eigh((residuals * shares[:, None]).T @ residuals)  # eq. 14
         covariance = (vectors * np.maximum(values, np.square(self.minimum_noise))) @ vectors.T
