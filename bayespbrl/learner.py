@@ -276,7 +276,7 @@ class Learner:
         """The question for a person, asked if need be; None when finished."""
         while not self.finished:
             for query in self.state.open:
-                if self.state.may_answer(query, answerer):
+                if self.state.may_answer(query, answerer, self.settings):
                     return query
             entry = self.cycle.next(self.state, answerer, others=0)  # past the questions of others
             if entry is None:

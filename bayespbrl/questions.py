@@ -39,6 +39,8 @@ class Questions:
         person sees a part in seconds.
       repeats: share of the questions that are an earlier one with sides swapped. They are for people: the answers tell
         how consistent each is. They count for the budget of answers, and not as those of an iteration.
+      shared_repeats: whether a repeated question may be one that somebody else answered: the answers then also tell how
+        well people agree.
     """
 
     query: str = "highest-utility"
@@ -50,6 +52,7 @@ class Questions:
     worthwhile: bool = False
     clip_steps: int | None = None
     repeats: float = 0.0
+    shared_repeats: bool = False
 
     def __post_init__(self) -> None:
         checks.one_of("query", self.query, (*QUERY_RULES, "other"))
@@ -59,7 +62,7 @@ class Questions:
         checks.share("repeats", self.repeats, below_one=True)
         checks.optional(checks.whole, "answers", self.answers)
         checks.optional(checks.whole, "clip_steps", self.clip_steps)
-        for name in ("same_start", "worthwhile"):
+        for name in ("same_start", "worthwhile", "shared_repeats"):
             checks.boolean(name, getattr(self, name))
         if self.same_start and self.clip_steps is not None:
             raise ValueError("same_start: expected false with clip_steps, because clips begin at any step, got true")
@@ -145,7 +148,8 @@ def repeated(
     Args:
       past: the questions so far that were answered.
       left: answers of the budget that nothing else is wanted for.
-      rng: chooses among one person's that have not been repeated, without the last few.
+      rng: chooses among one person's that have not been repeated, without the last few; among all people's where
+        repeats are shared.
       answerer: who is asked, since only who answered a question can be consistent; None: whoever answered last.
     """
     done = {question.repeats for question in past}
@@ -153,5 +157,5 @@ def repeated(
         return None
     new = [each for each in past[:-LEAST_BETWEEN] if each.repeats is None and each.answer is not Answer.SKIP]
     person = past[-1].answerer if past and answerer is None else answerer
-    suitable = [each for each in new if each.number not in done and each.answerer == person]
+    suitable = [each for each in new if each.number not in done and (options.shared_repeats or each.answerer == person)]
     return suitable[rng.integers(len(suitable))] if suitable else None

@@ -283,6 +283,9 @@ def test_the_figures_of_each_person_by_hand():
     assert table["cannot_tell"].values.tolist() == [0, 1]
     assert table["repeated"].values.tolist() == [2, 0]  # what another answered before says nothing of Bob
     assert table["consistent"].values.tolist() == [1, 0]
+    assert table["shared"].values.tolist() == [1, 1]  # 1, which Bob answered the other way round
+    assert table["agreed"].values.tolist() == [0, 0]
+    np.testing.assert_allclose(table["agreement_upper"].values, 0.95, atol=1e-9)  # the root of 1 - p = 0.05
     assert table["seconds"].values.tolist() == [3.5, 1.0]
     # Clopper and Pearson's interval of 1 of 2 at 90 %: the roots of (1 - p)² = 0.95 and p² = 0.95
     lower, upper = 1 - np.sqrt(0.95), np.sqrt(0.95)

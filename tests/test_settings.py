@@ -58,6 +58,7 @@ BAD = {
     "worthwhile": [None, 1, "yes"],
     "plain_draws": [0, 15, 200.0, True],
     "repeats": [None, 1, -0.1, "all"],
+    "shared_repeats": [None, 1, "yes"],
     "checked": [None, 1, "yes"],
     "check_episodes": [None, 1, 2.5, True],
     "restart_iterations": [None, -1, 2.5, True],

@@ -10,6 +10,7 @@ from toys import QUICK, fingerprint
 
 import bayespbrl
 from bayespbrl.cli.commands import main
+from bayespbrl.diagnostics import people
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session
 from bayespbrl.people.views import FAILED, FINISHED, QUESTION, WAITING
@@ -221,6 +222,38 @@ def test_a_question_is_repeated_to_the_person_who_answered_it(sitting):
     again = [question for question in past.values() if question.repeats is not None]
     assert again
     assert all(question.answerer == past[question.repeats].answerer for question in again)
+
+
+def test_shared_repeats_go_to_two_people_and_the_report_tells_how_well_they_agree(sitting, tmp_path):
+    options = QUICK | {"iterations": 8, "repeats": 0.4, "shared_repeats": True}
+    learner = bayespbrl.start("gridworld", tmp_path / "shared", expert="page", **options)
+    session, (ada, _), (ben, _) = sitting(learner)
+    turns = 0
+    while True:
+        settled(session)
+        if session.over:
+            break
+        seat = [seat for seat in (ada, ben) if seat.view["phase"] == QUESTION][:: (-1) ** turns][0]
+        seat.answer(seat.view["turn"], "first")
+        turns += 1
+    past = {question.number: question for question in learner.state.past}
+    again = [question for question in past.values() if question.repeats is not None]
+    shared = [question for question in again if question.answerer != past[question.repeats].answerer]
+    assert 0 < len(shared) <= len(again)
+    figures = people(learner.state.past)
+    assert figures["shared"].values.tolist() == [len(shared)] * 2
+    assert figures["agreed"].values.tolist() == [0, 0]  # the sides were swapped, and both said "first"
+    assert fingerprint(bayespbrl.load(learner.log.path).learner) == fingerprint(learner)
+    report = bayespbrl.load(learner.log.path).report("md").read_text()
+    assert f"0 of {len(shared)} (0 to " in report.split("same as others")[1]
+
+
+def test_where_repeats_are_shared_one_that_waits_is_shown_to_whoever_is_there(tmp_path):
+    options = QUICK | {"iterations": 8, "repeats": 0.3, "shared_repeats": True}
+    learner = bayespbrl.start("gridworld", tmp_path / "left", expert="page", **options)
+    while (query := learner.ask()[0]).repeats is None:
+        learner.tell(["first"], answerer="Ada")
+    assert alone(tmp_path / "left", "Bob", answers=1)[0] == [query.number]
 
 
 @pytest.fixture

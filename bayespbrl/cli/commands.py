@@ -105,6 +105,7 @@ RUN_OPTIONS = {
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
     "repeats": "Share of the questions that repeat an earlier one with sides swapped, to measure how consistent a "
     "person is; 0.1 for people, 0 for a simulated expert.",
+    "shared_repeats": "Let repeated questions be other people's too, so that the report tells how well people agree.",
     "expert": "Who answers: return (simulated, always right), page (you, in a browser), terminal (you, at the prompt), "
     "or a simulated expert who errs: stochastic, myopic, skipping, equal, mistaken (B-Pref's teachers) or margin "
     "(the error model of Programming by Feedback).",

@@ -24,37 +24,58 @@ def people(past: Sequence[PastQuestion], posterior: xr.DataTree | None = None) -
       standard deviations of the margins; NaN where it is not inferred); `repeated`, how many of their answers were
       asked for again from them and answered, and `consistent`, how many of these said the same, with
       `consistency_lower` and `consistency_upper`, the exact 90 % interval of its share (Clopper and Pearson 1934);
+      `shared`, how many of their questions somebody else answered too, and `agreed`, how many of these alike, with
+      `agreement_lower` and `agreement_upper`;
       `seconds`, the median response time, NaN where none is known, with `seconds_lower` and `seconds_upper`, two order
       statistics between which the median lies with a probability of at least 90 %, NaN with fewer than five times.
     """
     names = list(dict.fromkeys(question.answerer or "" for question in past))
     # a posterior that knows no names was fitted to one answerer: whoever answered first
     alone = next((question.answerer or "" for question in past if question.answer is not Answer.SKIP), "")
+    pairs = _asked_twice(past)
     rows = [
-        _figures(name, [q for q in past if (q.answerer or "") == name], _known_to(posterior, name, alone))
+        _figures(name, [q for q in past if (q.answerer or "") == name], pairs, _known_to(posterior, name, alone))
         for name in names
     ]
-    columns = rows[0] if rows else _figures("", [], None)
+    columns = rows[0] if rows else _figures("", [], [], None)
     data = {name: ("answerer", np.array([row[name] for row in rows])) for name in columns}
     return xr.Dataset(data, coords={"answerer": np.array(names, dtype=object)})
 
 
-def _figures(name: str, past: Sequence[PastQuestion], posterior: xr.DataTree | None) -> dict[str, float]:
+def _asked_twice(past: Sequence[PastQuestion]) -> list[tuple[PastQuestion, PastQuestion]]:
+    """The questions that were answered twice, each with the one that repeats it."""
+    earlier = {question.number: question for question in past if question.answer is not Answer.SKIP}
+    return [(earlier[each.repeats], each) for each in earlier.values() if each.repeats in earlier]
+
+
+def _alike(pairs: Sequence[tuple[PastQuestion, PastQuestion]]) -> tuple[int, float, float]:
+    """How many pairs of answers say the same, and the exact interval of their share (Clopper and Pearson 1934)."""
+    same = sum(one.preferred == other.preferred for one, other in pairs)
+    interval = stats.binomtest(same, len(pairs)).proportion_ci(LEVEL, method="exact") if pairs else (0.0, 1.0)
+    return same, float(interval[0]), float(interval[1])
+
+
+def _figures(
+    name: str,
+    past: Sequence[PastQuestion],
+    twice: Sequence[tuple[PastQuestion, PastQuestion]],
+    posterior: xr.DataTree | None,
+) -> dict[str, float]:
     given = [question for question in past if question.answer is not Answer.SKIP]
-    earlier = {question.number: question for question in given}
-    again = [(earlier[q.repeats], q) for q in given if q.repeats in earlier]
-    consistent = sum(one.preferred == other.preferred for one, other in again)
+    theirs = [pair for pair in twice if name in (pair[0].answerer or "", pair[1].answerer or "")]
+    again = [pair for pair in theirs if pair[0].answerer == pair[1].answerer]
+    shared = [pair for pair in theirs if pair[0].answerer != pair[1].answerer]
     times = [question.seconds for question in past if question.seconds is not None]
     figures: dict[str, float] = {
         "answers": len(given),
         "ties": sum(question.answer is Answer.TIE for question in given),
         "cannot_tell": len(past) - len(given),
         "repeated": len(again),
-        "consistent": consistent,
+        "shared": len(shared),
         "seconds": float(np.median(times)) if times else np.nan,
     }
-    interval = stats.binomtest(consistent, len(again)).proportion_ci(LEVEL, method="exact") if again else (0.0, 1.0)
-    figures |= {"consistency_lower": float(interval[0]), "consistency_upper": float(interval[1])}
+    figures["consistent"], figures["consistency_lower"], figures["consistency_upper"] = _alike(again)
+    figures["agreed"], figures["agreement_lower"], figures["agreement_upper"] = _alike(shared)
     figures["seconds_lower"], figures["seconds_upper"] = _around_median(times)
     for quantity in ("lapse_rate", "side_bias"):
         draws = _draws(name, quantity, posterior)

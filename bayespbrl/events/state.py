@@ -103,12 +103,12 @@ class LearnerState:
         """Whether the next trajectories follow the first policy again."""
         return self.restart is None and settings.restarts(self.iteration, self.preferences.answers, self.unasked)
 
-    def may_answer(self, query: Query, person: str | None) -> bool:
+    def may_answer(self, query: Query, person: str | None, settings: Settings) -> bool:
         """Whether a person, None without a name, may answer: a repeat is for whoever answered the question before.
 
-        Someone without a name may answer each.
+        Someone without a name may answer each, and anybody where repeats are shared.
         """
-        if query.repeats is None or person is None:
+        if query.repeats is None or person is None or settings.questions.shared_repeats:
             return True
         return any(past.number == query.repeats and past.answerer == person for past in self.past)
 

@@ -148,12 +148,14 @@ class Foresight:
 
         A repeated question is left to those who may answer it.
         """
-        if state.finished(self.cycle.settings):
+        settings = self.cycle.settings
+        if state.finished(settings):
             return {}
         waiting = {query.number: query for query in state.open}
         holders = {number: who for number, who in before.items() if number in waiting and who in self.people}
         for query in sorted(state.open, key=lambda query: query.answerer not in self.people):
-            free = [who for who in self.people if who not in holders.values() and state.may_answer(query, who)]
+            free = [who for who in self.people if who not in holders.values()]
+            free = [who for who in free if state.may_answer(query, who, settings)]
             if free and query.number not in holders:
                 holders[query.number] = query.answerer if query.answerer in free else free[0]
         return holders

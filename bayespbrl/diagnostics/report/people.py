@@ -26,13 +26,16 @@ def has_people(contents: RunContents) -> bool:
 def people_section(contents: RunContents) -> Body:
     """The figures of each person, and the warnings about them."""
     table = _table(contents)
-    head = ["person", "answers", "ties", "cannot tell", "lapse rate", "side bias", "same on repeats", "median time"]
+    head = ["person", "answers", "ties", "cannot tell", "lapse rate", "side bias", "same on repeats"]
+    head += ["same as others"] * _are_shared(table) + ["median time"]
     given = contents.model.lapse_rate is not None
-    rows = [_row(table.isel(answerer=place), given=given) for place in range(table.sizes["answerer"])]
+    shared = _are_shared(table)
+    rows = [_row(table.isel(answerer=place), given=given, shared=shared) for place in range(table.sizes["answerer"])]
     caption = (
         "Everyone who answered, with 90 % intervals. Lapse rate: the share of answers given at random. Side bias: "
         "how much better the trajectory shown first looks, in standard deviations of the utility differences. Same on "
         "repeats: how many repeated questions were answered as before, with the exact interval of the share. "
+        f"{'Same as others: how many questions that somebody else answered too were answered alike. ' * shared}"
         "Median time: the interval holds the median of all their answers, by order statistics; from five times on."
     )
     text = [f"{warning.what} {warning.remedy}" for warning in people_warnings(contents)]
@@ -54,9 +57,17 @@ def _table(contents: RunContents) -> xr.Dataset:
     return people(contents.past, contents.posterior)
 
 
-def _row(one: xr.Dataset, *, given: bool) -> list[str]:
-    repeated, consistent, seconds = (float(one[name]) for name in ("repeated", "consistent", "seconds"))
-    share = f"{consistent:.0f} of {repeated:.0f} ({_range(one, 'consistency')})" if repeated else "–"
+def _are_shared(table: xr.Dataset) -> bool:
+    """Whether some question was answered by two people."""
+    return bool(np.any(table["shared"].values))
+
+
+def _row(one: xr.Dataset, *, given: bool, shared: bool) -> list[str]:
+    repeated, seconds = int(one["repeated"]), float(one["seconds"])
+    shares = [f"{int(one['consistent'])} of {repeated} ({_range(one, 'consistency')})" if repeated else "–"]
+    if shared:
+        both = int(one["shared"])
+        shares.append(f"{int(one['agreed'])} of {both} ({_range(one, 'agreement')})" if both else "–")
     inferred = [
         "–" if np.isnan(float(one[name])) else f"{number(round(float(one[name]), 3))} ({_range(one, name)})"
         for name in ("lapse_rate", "side_bias")
@@ -67,7 +78,7 @@ def _row(one: xr.Dataset, *, given: bool) -> list[str]:
     if not np.isnan(float(one["seconds_lower"])):
         time += f" ({float(one['seconds_lower']):.1f} to {float(one['seconds_upper']):.1f})"
     counts = [str(int(one[name])) for name in ("answers", "ties", "cannot_tell")]
-    return [_name(one), *counts, *inferred, share, time]
+    return [_name(one), *counts, *inferred, *shares, time]
 
 
 def _range(one: xr.Dataset, name: str) -> str:
