@@ -18,7 +18,7 @@ import pytest
 import xarray as xr
 from toys import INTERRUPTIBLE, SHORT
 
-from bayespbrl import ReturnExpert, load, runs, start
+from bayespbrl import ReturnExpert, load, resume, start
 from bayespbrl.rollouts import returns
 from bayespbrl.studies import Trials, rows, run_trials
 from bayespbrl.studies import trials as trials_module
@@ -330,4 +330,4 @@ def test_a_study_that_is_stopped_takes_its_trials_with_it(tmp_path, how):
     lengths = [log.stat().st_size for log in logs]
     time.sleep(1.0)
     assert [log.stat().st_size for log in logs] == lengths
-    assert not runs.resume(tmp_path / "study" / "seed-1000").finished
+    assert not resume(tmp_path / "study" / "seed-1000").finished
