@@ -166,6 +166,7 @@ def test_the_gaussian_of_many_contradicting_answers_is_as_wide_as_their_posterio
 
 @pytest.mark.slow
 def test_a_threshold_may_be_given_where_nobody_was_undecided_and_k_is_another():
-    tree = sample_posterior(answers(70, seed=3), tie_threshold=0.1, number_of_preferences=80, num_samples=100)
+    few = {"num_samples": 25, "max_samples": 25}
+    tree = sample_posterior(answers(70, seed=3), tie_threshold=0.1, number_of_preferences=80, **few)
     assert tree["posterior/margins"].shape[2] == 70
     assert np.all(tree["posterior/tie_threshold"] == 0.1)
