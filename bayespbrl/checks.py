@@ -142,13 +142,18 @@ def pairs(name: str, values: Any) -> np.ndarray:
     return array.astype(np.int64)
 
 
-def in_one_line(error: Exception) -> str:
-    """What an error says, without line breaks; its type where it says nothing."""
-    return " ".join(str(error).split()) or type(error).__name__
+def one_line(value: object) -> str:
+    """The text of a value or an error without line breaks."""
+    return " ".join(str(value).split())
+
+
+def reason(error: Exception) -> str:
+    """What an error says, in one line; its type where it says nothing."""
+    return one_line(error) or type(error).__name__
 
 
 def _shortened(values: Any) -> str:
-    text = " ".join(repr(values).split())
+    text = one_line(repr(values))
     return text if len(text) <= 60 else text[:60] + "…"
 
 

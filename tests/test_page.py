@@ -267,8 +267,8 @@ def test_while_the_learner_computes_the_page_says_thinking(browser, gridworld):
         assert answers_of(gridworld) == ["first"]
 
 
-def test_a_page_that_hears_no_more_views_says_so_and_goes_on_when_it_hears_them_again(browser, gridworld):
-    gridworld.session.wait(timeout=60)
+def broken_stream(page):
+    """What routes requests of views: one view, then none until it is `back`; and the requests so far."""
     back, tried = threading.Event(), []
 
     def break_off(route):
@@ -277,9 +277,15 @@ def test_a_page_that_hears_no_more_views_says_so_and_goes_on_when_it_hears_them_
             return route.continue_()
         if len(tried) > 1:
             return route.abort()
-        body = f"data: {json.dumps(gridworld.session.view)}\n\n"  # and then the stream ends
+        body = f"data: {json.dumps(page.session.view)}\n\n"  # and then the stream ends
         return route.fulfill(body=body, content_type="text/event-stream")
 
+    return break_off, back, tried
+
+
+def test_a_page_that_hears_no_more_views_says_so_and_goes_on_when_it_hears_them_again(browser, gridworld):
+    gridworld.session.wait(timeout=60)
+    break_off, back, tried = broken_stream(gridworld)
     with tab(browser, gridworld, before=lambda opened: opened.route("**/events", break_off)) as opened:
         opened.wait_for_selector(".bp-note >> text=The connection is lost. Trying again…")
         until(opened, lambda: len(tried) >= 3)
@@ -291,19 +297,11 @@ def test_a_page_that_hears_no_more_views_says_so_and_goes_on_when_it_hears_them_
 
 def test_a_page_that_is_not_answered_for_long_says_what_to_do_and_goes_on_when_it_is(browser, gridworld):
     gridworld.session.wait(timeout=60)
-    back, tried = threading.Event(), []
+    break_off, back, _ = broken_stream(gridworld)
 
     def before(opened):
         opened.add_init_script("const now = performance.now.bind(performance); performance.now = () => 20 * now()")
-        opened.route("**/events", listened)
-
-    def listened(route):
-        tried.append(route)
-        if back.is_set():
-            return route.continue_()
-        if len(tried) > 1:
-            return route.abort()
-        return route.fulfill(body=f"data: {json.dumps(gridworld.session.view)}\n\n", content_type="text/event-stream")
+        opened.route("**/events", break_off)
 
     with tab(browser, gridworld, before=before) as opened:
         opened.wait_for_selector(".bp-note >> text=start it again")

@@ -207,19 +207,23 @@ def test_a_sitting_of_several_ends_after_its_answers_and_asks_for_no_more(sittin
     assert session.learner.preferences.answers == 3
 
 
-def test_a_question_is_repeated_to_the_person_who_answered_it(sitting):
-    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK | {"iterations": 8, "repeats": 0.3})
-    session, (ada, _), (ben, _) = sitting(learner)
+def answered_to_the_end(session, *sitters):
+    """Both always say "first", the one and the other in turn: the answered questions by number, and the repeats."""
     turns = 0
     while True:
         settled(session)
         if session.over:
             break
-        seat = [seat for seat in (ada, ben) if seat.view["phase"] == QUESTION][:: (-1) ** turns][0]
+        seat = [seat for seat, _ in sitters if seat.view["phase"] == QUESTION][:: (-1) ** turns][0]
         seat.answer(seat.view["turn"], "first")
         turns += 1
-    past = {question.number: question for question in learner.state.past}
-    again = [question for question in past.values() if question.repeats is not None]
+    past = {question.number: question for question in session.learner.state.past}
+    return past, [question for question in past.values() if question.repeats is not None]
+
+
+def test_a_question_is_repeated_to_the_person_who_answered_it(sitting):
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK | {"iterations": 8, "repeats": 0.3})
+    past, again = answered_to_the_end(*sitting(learner))
     assert again
     assert all(question.answerer == past[question.repeats].answerer for question in again)
 
@@ -227,17 +231,7 @@ def test_a_question_is_repeated_to_the_person_who_answered_it(sitting):
 def test_shared_repeats_go_to_two_people_and_the_report_tells_how_well_they_agree(sitting, tmp_path):
     options = QUICK | {"iterations": 8, "repeats": 0.4, "shared_repeats": True}
     learner = bayespbrl.start("gridworld", tmp_path / "shared", expert="page", **options)
-    session, (ada, _), (ben, _) = sitting(learner)
-    turns = 0
-    while True:
-        settled(session)
-        if session.over:
-            break
-        seat = [seat for seat in (ada, ben) if seat.view["phase"] == QUESTION][:: (-1) ** turns][0]
-        seat.answer(seat.view["turn"], "first")
-        turns += 1
-    past = {question.number: question for question in learner.state.past}
-    again = [question for question in past.values() if question.repeats is not None]
+    past, again = answered_to_the_end(*sitting(learner))
     shared = [question for question in again if question.answerer != past[question.repeats].answerer]
     assert 0 < len(shared) <= len(again)
     figures = people(learner.state.past)

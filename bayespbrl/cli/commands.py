@@ -331,5 +331,5 @@ def _check_expert(name: str | None, answerers: Sequence[str]) -> None:
 
 
 def _print_error(message: str) -> int:
-    print(f"bayespbrl: {' '.join(message.split())}", file=sys.stderr)
+    print(f"bayespbrl: {checks.one_line(message)}", file=sys.stderr)
     return 2

@@ -13,6 +13,7 @@ from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box, Discrete, Space, flatten, flatten_space
 from gymnasium.wrappers import TransformAction, TransformObservation
 
+from bayespbrl import checks
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.envs.functional import FunctionalEnv
 
@@ -143,7 +144,7 @@ def _spec(environment: str | EnvSpec) -> EnvSpec:
     except Exception as error:  # a module of the user's may raise anything
         raise ValueError(
             f"environment: expected {', '.join(SHORT_NAMES)} or a registered gymnasium id, got {environment!r} "
-            f"({_one_line(error)})"
+            f"({checks.one_line(error)})"
         ) from error
 
 
@@ -152,12 +153,8 @@ def _make(spec: EnvSpec) -> gymnasium.Env:
         return gymnasium.make(spec)
     except Exception as error:
         raise ValueError(
-            f"environment {spec.id}: expected one that gymnasium.make can make, got {_one_line(error)}"
+            f"environment {spec.id}: expected one that gymnasium.make can make, got {checks.one_line(error)}"
         ) from error
-
-
-def _one_line(value: object) -> str:
-    return " ".join(str(value).split())
 
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
@@ -225,7 +222,7 @@ def to_plain(
     try:
         return np.asarray(flatten(space, value), np.float64)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"observation: expected one of {space}, got {_one_line(value)}") from error
+        raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}") from error
 
 
 def from_plain(space: Any, value: Any) -> np.ndarray | np.int64:

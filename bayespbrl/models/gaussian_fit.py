@@ -55,10 +55,9 @@ def fit_gaussian(
     number, dimension = differences.shape
     if dimension == 0:
         raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
-    if indifferent is None and model.tie_threshold is not None:
-        indifferent = np.zeros(number, dtype=bool)
     tied = None if indifferent is None else checks.flags("indifferent", indifferent, number)
-    likelihood = model.answer_likelihood(number if number_of_preferences is None else number_of_preferences, tied)
+    known = number if number_of_preferences is None else number_of_preferences
+    likelihood = model.answer_likelihood(known, _which_tied(tied, model, number))
     with one_blas_thread():
         factors = low_rank(differences)
         used = used_rows(factors.loadings)
@@ -81,9 +80,7 @@ def refitted(
 
     `widening` is for many answers: the factor of a violated answer may widen the Gaussian, where that converges.
     """
-    if tied is None and model.tie_threshold is not None:
-        tied = np.zeros(len(fit.differences), dtype=bool)
-    likelihood = model.answer_likelihood(number_of_preferences, tied)
+    likelihood = model.answer_likelihood(number_of_preferences, _which_tied(tied, model, len(fit.differences)))
     with one_blas_thread():
         approximation = None
         if widening:
@@ -92,6 +89,11 @@ def refitted(
         if approximation is None or not approximation.converged:
             approximation = _approximation(fit.factors, likelihood, model.prior_scale)
         return replace(fit, approximation=approximation)
+
+
+def _which_tied(tied: ArrayLike | None, model: PreferenceModel, number: int) -> ArrayLike | None:
+    """None of K answers where a threshold is given and nobody was undecided: K of eq. 8 may be another."""
+    return np.zeros(number, dtype=bool) if tied is None and model.tie_threshold is not None else tied
 
 
 def _approximation(
@@ -110,9 +112,11 @@ def _approximation(
         mixture = answers.probit_mixture().of(used)
         return expectation_propagation(loadings, mixture, prior_scale=prior_scale, widening=widening)
 
-    fit, ties = fitted(likelihood), ties_of(likelihood)
+    fit = fitted(likelihood)
+    if isinstance(likelihood, WithLapses) or not has_steps(likelihood):
+        return fit
+    ties = ties_of(likelihood)
     ordered = np.ones(len(loadings), dtype=bool) if ties is None else ~np.asarray(ties.indifferent)[used]
-    lapse = isinstance(likelihood, WithLapses) or not has_steps(likelihood)
-    if lapse or np.all(loadings[ordered] @ fit.mean >= 0):
+    if np.all(loadings[ordered] @ fit.mean >= 0):
         return fit
     return replace(fitted(WithLapses(likelihood, NOW_AND_THEN)), log_evidence=fit.log_evidence)

@@ -23,6 +23,7 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from bayespbrl import checks
 from bayespbrl.people.seat import Seat, Stale
 from bayespbrl.people.session import Session, answer_of
 
@@ -161,7 +162,7 @@ class Page:
         except Stale as error:
             return PlainTextResponse(str(error), 409)
         except (ValueError, RecursionError) as error:
-            return PlainTextResponse(" ".join(str(error).split())[:300], 400)
+            return PlainTextResponse(checks.one_line(error)[:300], 400)
         return Response(status_code=204)
 
     def _take(

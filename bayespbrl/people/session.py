@@ -195,7 +195,7 @@ class Session:
         try:
             self.learner.record(entry)
         except OSError as error:
-            raise ValueError(f"your answer was not kept: {checks.in_one_line(error)}") from error
+            raise ValueError(f"your answer was not kept: {checks.reason(error)}") from error
 
     # The thread that thinks.
 
@@ -233,7 +233,7 @@ class Session:
     def _failed(self, moment: Moment, error: Exception) -> None:
         moment.failed = True
         if moment is self._foresight.present:
-            reason = checks.in_one_line(error)
+            reason = checks.reason(error)
             for seat in self.seats:
                 seat.set(self._described(seat, FAILED) | {"say": f"Stopped: {reason} Your answers are kept."})
 

@@ -140,7 +140,7 @@ def _read(file: Path, columns: list[str]) -> pd.DataFrame:
         missing = {name: [""] for name in (*ITERATION_COLUMNS, *ANSWER_COLUMNS, *FIGURES) if name not in AXES}
         table = pd.read_csv(file, dtype=dict.fromkeys(AXES, str), keep_default_na=False, na_values=missing)
     except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
-        raise ValueError(f"{file}: expected a table, got {checks.in_one_line(error)}") from error
+        raise ValueError(f"{file}: expected a table, got {checks.reason(error)}") from error
     if absent := [name for name in columns if name not in table]:
         raise ValueError(f"{file}: expected the columns {', '.join(columns)}, got none of {', '.join(absent)}")
     for name in ("seed", "iteration", "answers", "value", "predicted"):

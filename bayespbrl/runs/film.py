@@ -50,7 +50,7 @@ def film_policy(learner: Learner, directory: Path) -> tuple[Path, Path]:
                 pictures.animation(frames, gif, milliseconds=milliseconds)
                 pictures.contact_sheet(frames, png)
     except Exception as error:  # whatever a drawing or rendering of the user's raises
-        name, reason = environment_name(environment), checks.in_one_line(error)
+        name, reason = environment_name(environment), checks.reason(error)
         raise ValueError(f"environment {name} cannot be rendered: {reason}") from error
     return film, strip
 

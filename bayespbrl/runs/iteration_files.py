@@ -74,7 +74,7 @@ def read_parts(
         _check_numbers(tree)
         parts = {name: read[name](tree) for name in names}
     except (OSError, KeyError, RuntimeError, AttributeError, TypeError, ValueError, MemoryError, IndexError) as error:
-        reason = checks.in_one_line(error)
+        reason = checks.reason(error)
         raise ValueError(f"{file.name}: expected the netCDF file of an iteration, got {reason}") from error
     return parts
 

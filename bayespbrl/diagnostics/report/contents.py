@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from gymnasium.experimental.functional import FuncEnv
 
+from bayespbrl import checks
 from bayespbrl.diagnostics.estimates import predicted_answer
 from bayespbrl.diagnostics.predictions import fitted_model
 from bayespbrl.diagnostics.report.document import ReportWarning
@@ -223,7 +224,7 @@ def _check_fitting(contents: RunContents, parts: Mapping[str, Any], features: St
             estimate.trajectory_draws(trajectories[:1], number=2)
     except Exception as error:  # of damaged arrays, anything
         raise ValueError(
-            f"expected an estimate that fits, got {type(error).__name__}: {' '.join(str(error).split())}"
+            f"expected an estimate that fits, got {type(error).__name__}: {checks.one_line(error)}"
         ) from error
 
 
@@ -234,7 +235,7 @@ def _features_failure(estimate: UtilityEstimate, features: StateFeatures | None,
     try:
         width = checked_features(features, trajectory.states).shape[1]
     except Exception as error:  # a function of the user's may raise anything
-        return f"the one that was passed fails ({type(error).__name__}: {' '.join(str(error).split())})"
+        return f"the one that was passed fails ({type(error).__name__}: {checks.one_line(error)})"
     expected = estimate.number_of_features
     return "" if width == expected else f"the one that was passed has {width} features, the run's {expected}"
 

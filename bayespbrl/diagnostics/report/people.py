@@ -26,10 +26,10 @@ def has_people(contents: RunContents) -> bool:
 def people_section(contents: RunContents) -> Body:
     """The figures of each person, and the warnings about them."""
     table = _table(contents)
+    shared = bool(np.any(table["shared"].values))  # whether some question was answered by two people
     head = ["person", "answers", "ties", "cannot tell", "lapse rate", "side bias", "same on repeats"]
-    head += ["same as others"] * _are_shared(table) + ["median time"]
+    head += ["same as others"] * shared + ["median time"]
     given = contents.model.lapse_rate is not None
-    shared = _are_shared(table)
     rows = [_row(table.isel(answerer=place), given=given, shared=shared) for place in range(table.sizes["answerer"])]
     caption = (
         "Everyone who answered, with 90 % intervals. Lapse rate: the share of answers given at random. Side bias: "
@@ -55,11 +55,6 @@ def people_warnings(contents: RunContents) -> list[ReportWarning]:
 
 def _table(contents: RunContents) -> xr.Dataset:
     return people(contents.past, contents.posterior)
-
-
-def _are_shared(table: xr.Dataset) -> bool:
-    """Whether some question was answered by two people."""
-    return bool(np.any(table["shared"].values))
 
 
 def _row(one: xr.Dataset, *, given: bool, shared: bool) -> list[str]:

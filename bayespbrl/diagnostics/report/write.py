@@ -112,7 +112,7 @@ def _section(name: str, title: str, build: Callable[[], Body], failures: list[Re
     try:
         return Section(name, title, *build())
     except Exception as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        reason = f"{type(error).__name__}: {checks.one_line(error)}"
         what = f"The section “{title}” could not be made ({reason})."
         failures.append(ReportWarning(what, "The other sections are unaffected."))
         return Section(name, title, [f"This section could not be made: {reason}."], [])
