@@ -56,7 +56,7 @@ class NoisyExpert:
         if not callable(self.expert):
             raise ValueError(f"expert: expected a function of two trajectories, got {self.expert!r}")
         checks.share("wrong_answers", self.wrong_answers)
-        checks.whole("seed", self.seed, 0)
+        checks.seed(self.seed)
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
         answer = parse_answer(self.expert(first, second))
@@ -101,7 +101,7 @@ class Teacher:
             raise ValueError(f"least_return: expected a number, got {self.least_return!r}")
         checks.non_negative("equal_within", self.equal_within)
         checks.share("mistakes", self.mistakes)
-        checks.whole("seed", self.seed, 0)
+        checks.seed(self.seed)
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
         returns = first.total_reward, second.total_reward
@@ -138,7 +138,7 @@ class MarginExpert:
 
     def __post_init__(self) -> None:
         checks.positive("width", self.width)
-        checks.whole("seed", self.seed, 0)
+        checks.seed(self.seed)
 
     def error_probability(self, difference: float) -> float:
         """Probability of a wrong answer where the returns differ by `difference`."""

@@ -541,9 +541,30 @@ def test_a_part_of_an_episode_is_filmed_by_an_environment_that_begins_at_the_res
             np.testing.assert_array_equal(shown > 127, env.render()[:, :, 0] > 127)
 
 
-@pytest.mark.parametrize("env", [Camera(jumps=True), Camera(render_mode=None), Slope(), Many()])
-def test_where_an_episode_cannot_be_filmed_its_observations_are_plotted(env):
+class Blind(Camera):
+    """Says that it renders, and fails."""
+
+    def render(self):
+        raise OSError("no display")
+
+
+@pytest.mark.parametrize("env", [Slope(), Many()])
+def test_where_an_environment_has_no_pictures_its_observations_are_plotted(env):
     clips = clips_of(env)
+    assert {(clip.width, clip.height) for clip in clips} == {(440, 400)}
+
+
+@pytest.mark.parametrize(
+    ("env", "reason"),
+    [
+        (Camera(jumps=True), "reset with the same seed, it does not repeat its episode"),
+        (Camera(render_mode=None), "expected render_mode rgb_array, got None"),
+        (Blind(), "no display"),
+    ],
+)
+def test_where_an_episode_cannot_be_filmed_a_warning_says_why_there_are_plots(env, reason):
+    with pytest.warns(UserWarning, match=f"{type(env).__name__} is not rendered but plotted: {reason}"):
+        clips = clips_of(env)
     assert {(clip.width, clip.height) for clip in clips} == {(440, 400)}
 
 

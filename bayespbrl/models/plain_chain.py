@@ -62,7 +62,9 @@ def plain_draws(
             "plain draws: expected one setting of the length scales, a steepness and a lapse rate, got "
             f"{len(settings)}, {model.steepness} and {model.lapse_rate}"
         )
-    number = settings.shape[1] if number_of_preferences is None else number_of_preferences
+    number = settings.shape[1]
+    if number_of_preferences is not None:
+        number = checks.whole("number_of_preferences", number_of_preferences, 0)
     fits = [fit_gaussian(settings[0], model, number_of_preferences=number)]
     # paper, experiments: as many samples for the burn-in as for the evaluation
     half = draws // 2

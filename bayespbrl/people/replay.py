@@ -1,5 +1,6 @@
 """A trajectory's episode once more, rendered by the environment itself in its mode `rgb_array`."""
 
+import warnings
 from collections.abc import Iterator
 
 import gymnasium
@@ -8,7 +9,9 @@ from gymnasium.spaces import Box
 from jaxtyping import Int
 from PIL import Image
 
+from bayespbrl import checks
 from bayespbrl.envs.functional import FunctionalEnv
+from bayespbrl.envs.opening import environment_name
 from bayespbrl.learner import Learner
 from bayespbrl.runs.film import rendered_frame, rendering
 from bayespbrl.trajectories import Trajectory
@@ -20,33 +23,41 @@ def replayed(
     """Pictures of the states `shown` of trajectory `number`, in increasing order.
 
     The environment is reset with the trajectory's seed and does its actions again, up to the last of these states.
-    Returns None where that does not lead to the same observations, bit for bit, or where the environment does not
-    render.
+    Returns None where the environment does not render, and, with a warning, where it fails to or where that does not
+    lead to the same observations, bit for bit.
 
     Args:
       trajectory: all of it, also where a question is about a part: an episode begins at its reset.
     """
-    if isinstance(learner.environment.unwrapped, FunctionalEnv):
+    environment = learner.environment
+    if isinstance(environment.unwrapped, FunctionalEnv):
         return None  # it draws by `draw`, which needs no episode
-    try:
-        env = rendering(learner.environment)
-    except Exception:  # whatever an environment of the user's raises: there are plots
+    if "rgb_array" not in (environment.render_mode, *(environment.metadata.get("render_modes") or ())):
         return None
+    try:
+        env = rendering(environment)
+    except Exception as error:  # whatever an environment of the user's raises: there are plots
+        return _told(environment, checks.reason(error))
     wanted, pictures = set(map(int, shown)), []
     try:
         for step, same in enumerate(_observed(env, learner.cycle.reset_seed(number), trajectory)):
             if not same:
-                return None
+                return _told(environment, "reset with the same seed, it does not repeat its episode")
             if step in wanted:
                 pictures.append(Image.fromarray(rendered_frame(env)))
             if len(pictures) == len(wanted):
                 break
-    except Exception:  # as above
-        return None
+    except Exception as error:  # as above
+        return _told(environment, checks.reason(error))
     finally:
-        if env is not learner.environment:
+        if env is not environment:
             env.close()
     return pictures
+
+
+def _told(environment: gymnasium.Env, reason: str) -> None:
+    """Say why there are no pictures of what should render."""
+    warnings.warn(f"{environment_name(environment)} is not rendered but plotted: {reason}", stacklevel=2)
 
 
 def _observed(env: gymnasium.Env, seed: int, trajectory: Trajectory) -> Iterator[bool]:
