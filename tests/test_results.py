@@ -22,6 +22,7 @@ from bayespbrl.results.intervals import (
     paired_difference,
     performance_profile,
 )
+from bayespbrl.results.study_data import StudyData
 from bayespbrl.studies import Study
 from bayespbrl.studies.declaration import parsed
 
@@ -96,15 +97,76 @@ def test_the_values_table_is_that_of_hand_made_trials(made):
     assert first["exact interval"] == f"[{bounds.low:.2f}, {bounds.high:.2f}]"
     assert (first["difference"], first["p (Holm)"]) == ("–", "–")
     assert second["difference"].startswith("-33.5 [")  # of −57, −38, −29, +60
-    assert second["at answers"] == "5"
+    assert (second["against"], second["pairs"], second["at answers"]) == ("first", "4", "5")
+    assert table.loc["known", "against"] == table.loc["known", "p (Holm)"] == "–"  # it defines the scale
     assert table.loc["random", "failed"] == "–"
     assert "noise" not in table.columns
+
+
+def without(made, chosen):
+    """The data without some lines."""
+    lines = pd.read_csv(made / "iterations.csv")
+    lines[~chosen(lines)].to_csv(made / "iterations.csv", index=False)
+
+
+def test_trials_that_are_compared_need_not_have_used_all_answers(made):
+    without(made, lambda lines: (lines["methods"] == "first") & (lines["seed"] == 4) & (lines["iteration"] > 1))
+    second = values_table(read_study(made)).set_index("methods").loc["second"]
+    assert second["at answers"] == "5"  # not 2, with which the first ended
+    assert second["difference"].startswith("-33.5 [")  # of −57, −38, −29, +40
+
+
+def test_a_value_after_more_answers_than_were_allowed_is_not_shown(made):
+    declared = made / "study.toml"
+    declared.write_text(DECLARATION.replace("[3]", "[5, 6]"))
+    first = values_table(read_study(made)).set_index("methods").loc["first"]
+    assert (first["after 5"], first["after 6"]) == ("97.5 [77.75]", "–")
+    declared.write_text(DECLARATION.replace("[3]", "[5, 6]").replace("[methods.first]", "[methods.first]\nanswers = 6"))
+    first = values_table(read_study(made)).set_index("methods").loc["first"]
+    assert first["after 6"] == first["after 5"]  # it might have asked once more
+
+
+def test_trials_that_are_missing_are_counted_and_never_replaced_by_another_row(made):
+    kept = json.loads((made / "study.json").read_text()) | {"trials": 4}
+    (made / "study.json").write_text(json.dumps(kept))
+    without(made, lambda lines: (lines["methods"] == "second") & (lines["seed"] == 2))
+    second = values_table(read_study(made)).set_index("methods").loc["second"]
+    assert (second["trials"], second["pairs"], second["seeds left out"]) == ("3 of 4", "3", "2")
+    without(made, lambda lines: lines["methods"] == "first")
+    data = read_study(made)
+    table = values_table(data)
+    assert "against" not in table  # `first` has no trials, and no other row is put in its place
+    assert "Without finished trials: gridworld/first." in data.source
+    without(made, lambda lines: (lines["methods"] == "second") & (lines["seed"] > 1))
+    assert "p (Holm)" not in values_table(read_study(made))
+
+
+def test_a_value_that_is_no_number_is_a_failed_trial(made):
+    lines = pd.read_csv(made / "iterations.csv")
+    lines.loc[(lines["methods"] == "first") & (lines["seed"] == 1) & (lines["iteration"] == 4), "value"] = np.nan
+    lines.to_csv(made / "iterations.csv", index=False)
+    assert values_table(read_study(made)).set_index("methods").loc["first", "failed"] == "2 of 4"
+
+
+def test_a_row_is_compared_under_the_same_noise_and_the_first_method_with_its_first_noise():
+    text = DECLARATION + '[noise.none]\n[noise.mistaken]\nexpert = "mistaken"\n[noise.skipping]\nexpert = "skipping"'
+    left_out = '\n[[leave_out]]\nmethods = ["first"]\nnoise = ["skipping"]'
+    study = parsed(text + left_out, "made")
+    data = StudyData(Path(), {}, study, (), None)
+    found = {row.name: data.reference_of(row) for row in study.rows}
+    assert {name: row and row.name for name, row in found.items() if "random" not in name and "known" not in name} == {
+        "gridworld/first/none": None,
+        "gridworld/first/mistaken": "gridworld/first/none",
+        "gridworld/second/none": "gridworld/first/none",
+        "gridworld/second/mistaken": "gridworld/first/mistaken",
+        "gridworld/second/skipping": "gridworld/second/none",  # the first method there
+    }
 
 
 def test_the_page_names_study_command_version_date_and_machine_and_counts_comparisons(made, tmp_path):
     page, *files = write_results(made, tmp_path / "out")
     text = page.read_text()
-    for part in ("Study `made`", "bayespbrl study made", "version 0.0", "2026-01-01", "a machine", "for 2 comparisons"):
+    for part in ("Study `made`", "bayespbrl study made", "version 0.0", "2026-01-01", "a machine", "one comparison"):
         assert part in text
     assert "| gridworld | first | the default | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
     assert {file.name for file in files} == {"values.csv", "runs.csv", "curves.png", "profiles.png"}
@@ -132,13 +194,14 @@ def test_pairs_of_trials_are_counted_by_the_answers_that_they_needed(made):
     assert pairs_table(read_study(made)).empty  # no value is declared
     declared = made / "study.toml"
     declared.write_text(declared.read_text().replace("[tasks.gridworld]", "[tasks.gridworld]\ngood_above = 50"))
-    second, known = pairs_table(read_study(made)).to_dict("records")
+    (second,) = pairs_table(read_study(made)).to_dict("records")
     assert (second["pairs"], second["fewer in all"], second["more in all"], second["p in all"]) == ("4", "0", "0", "1")
     # `first` is above 50 from the third answer on, but for its last policy of seed 4
     assert (second["fewer to 50"], second["more to 50"], second["p to 50"]) == ("0", "4", "0.12")
     assert second["median to 50"] == "5 against 3"
     assert (second["fewer to 50 for good"], second["more to 50 for good"]) == ("1", "3")
-    assert (known["fewer to 50"], known["more to 50"], known["p to 50"]) == ("4", "0", "0.12")
+    declared.write_text(declared.read_text().replace("good_above = 50", "good_above = 99"))
+    assert pairs_table(read_study(made)).loc[0, "median to 99"] == "never against never"
 
 
 def test_predictions_are_pooled_over_tasks_and_not_over_methods():

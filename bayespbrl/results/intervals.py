@@ -29,10 +29,10 @@ def resamples(number: int, *, samples: int = RESAMPLES, seed: int = 0) -> np.nda
 
 
 def median_interval(values: np.ndarray) -> Interval:
-    """The median of values of shape (S,) with its bootstrap interval; NaN bounds for a single value."""
+    """The median of values of shape (S,) with its bootstrap interval; NaN bounds for one value or among NaN."""
     values = np.asarray(values, dtype=np.float64)
     estimate = float(np.median(values))
-    if len(values) < 2:
+    if len(values) < 2 or np.isnan(estimate):
         return Interval(estimate, np.nan, np.nan)
     if np.ptp(values) == 0:
         return Interval(estimate, estimate, estimate)
@@ -56,6 +56,8 @@ def paired_difference(values: np.ndarray, reference: np.ndarray) -> tuple[Interv
     Source: Wilcoxon (1945); differences of zero as by Pratt (1959).
     """
     differences = np.asarray(values, dtype=np.float64) - np.asarray(reference, dtype=np.float64)
+    if np.any(np.isnan(differences)):
+        return median_interval(differences), np.nan
     if len(differences) < 2 or not np.any(differences):
         return median_interval(differences), 1.0
     return median_interval(differences), float(stats.wilcoxon(differences, zero_method="pratt").pvalue)

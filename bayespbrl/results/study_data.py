@@ -42,10 +42,18 @@ class RowData:
     final: np.ndarray
     lines: pd.DataFrame
 
+    @property
+    def allowed(self) -> int:
+        """The budget of answers: as declared, or else the most that a trial used."""
+        return max(int(self.used.max()), int(self.declared.options.get("answers", 0)))
+
     def at(self, answers: float) -> np.ndarray | None:
-        """Value of each trial after that many answers; None where some trial has no policy by then."""
+        """Value of each trial after that many answers, or its last where it ended with fewer.
+
+        None above the budget, and where some trial has no policy by then.
+        """
         reached = np.flatnonzero(self.answers <= answers)
-        return self.values[:, reached[-1]] if len(reached) else None
+        return self.values[:, reached[-1]] if len(reached) and answers <= self.allowed else None
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,27 @@ class StudyData:
         """The rows of a task."""
         return [row for row in self.rows if row.declared.levels[0] == task]
 
+    def row_of(self, declared: DeclaredRow) -> RowData | None:
+        """The trials of a declared row; None where none is finished."""
+        return next((row for row in self.rows if row.declared is declared), None)
+
+    def reference_of(self, declared: DeclaredRow) -> DeclaredRow | None:
+        """The row that another one is compared with; None for a task's first, and for those that define the scale.
+
+        The first method with the same noise and variant; of the first method, the first noise; of that, the first
+        variant.
+        """
+        if declared.of_scale:
+            return None
+        for axis in range(1, len(AXES)):
+            for other in self.declaration.rows:
+                same = [a == b for a, b in zip(declared.levels, other.levels, strict=True)]
+                if all(same[:axis] + same[axis + 1 :]) and not other.of_scale:
+                    if other is declared:
+                        break
+                    return other
+        return None
+
     def floor(self, task: str) -> float | None:
         """Median value of the random policy; None where the study has no such row."""
         floors = [row.final for row in self.of_task(task) if row.declared.untrained]
@@ -90,7 +119,7 @@ class StudyData:
         None where the study has no such rows, or the two are not in this order.
         """
         rows, floor = self.of_task(task), self.floor(task)
-        ceilings = [row.final for row in rows if row.declared.options.get("utility") == "known-reward"]
+        ceilings = [row.final for row in rows if row.declared.of_scale and not row.declared.untrained]
         if floor is None or not ceilings:
             return None
         ceiling = max(float(np.median(values)) for values in ceilings)
@@ -104,9 +133,11 @@ class StudyData:
             f"; some trials: source {part.get('source')}, {part.get('date')}, {part.get('machine')}"
             for part in kept.get("earlier", [])
         )
+        unfinished = [declared.name for declared in self.declaration.rows if self.row_of(declared) is None]
         return (
             f"Study `{self.name}` (`{kept.get('command')}`), version {kept.get('version')} (source "
             f"{kept.get('source')}), {kept.get('date')}, {kept.get('machine')}{earlier}."
+            f"{' Without finished trials: ' + ', '.join(unfinished) + '.' if unfinished else ''}"
         )
 
 

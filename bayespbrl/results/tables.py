@@ -17,7 +17,7 @@ from bayespbrl.results.intervals import (
     sign_test,
 )
 from bayespbrl.results.study_data import RowData, StudyData
-from bayespbrl.studies.declaration import AXES
+from bayespbrl.studies.declaration import AXES, DeclaredRow
 
 REACHED = 0.95  # of the relative value, (value − random policy) / (known reward − random policy)
 FAILED_BELOW = 0.5  # of the relative value, where the task declares no `failed_below`
@@ -27,7 +27,7 @@ MISSING = "–"
 
 
 def values_table(data: StudyData) -> pd.DataFrame:
-    """Final value of each row, and its difference from the first row of the same task.
+    """Final value of each row, and its difference from the row that it is compared with (`reference_of`).
 
     All comparisons are at the same number of answers on both sides, over shared seeds, and their p values are adjusted
     for the number of comparisons in the table (Holm); `false discovery` has Benjamini and Hochberg's.
@@ -35,22 +35,25 @@ def values_table(data: StudyData) -> pd.DataFrame:
     lines: list[dict[str, str]] = []
     p: list[tuple[int, float]] = []
     for task in data.tasks:
-        rows, scale = data.of_task(task), data.floor_and_ceiling(task)
-        learned = [row for row in rows if not row.declared.untrained]
-        for row in rows:
-            line = _of_trials(row, scale, data.declaration.report_at)
-            if learned and row is not learned[0] and row in learned:
-                difference, value, budget = _compared(row, learned[0])
-                line |= {"difference": difference, "at answers": budget}
+        scale = data.floor_and_ceiling(task)
+        for row in data.of_task(task):
+            line = _of_trials(row, scale, data)
+            if (declared := data.reference_of(row.declared)) is not None:
+                cells, value = _compared(row, data.row_of(declared))
+                line |= {"against": _without_task(declared)} | cells if cells else {}
                 p.append((len(lines), value))
             lines.append(line)
     table = pd.DataFrame(lines)
     compared = [(place, value) for place, value in p if np.isfinite(value)]
-    for name, adjust in (("p (Holm)", holm), ("false discovery", benjamini_hochberg)):
+    for name, adjust in (("p (Holm)", holm), ("false discovery", benjamini_hochberg)) if compared else ():
         table[name] = MISSING
         for (place, _), value in zip(compared, adjust([value for _, value in compared]), strict=True):
             table.loc[place, name] = f"{value:.2g}"
     return table.reindex(columns=_present(table)).fillna(MISSING)
+
+
+def _without_task(declared: DeclaredRow) -> str:
+    return " ".join(level for level in declared.levels[1:] if level)
 
 
 def _present(table: pd.DataFrame) -> list[str]:
@@ -58,11 +61,12 @@ def _present(table: pd.DataFrame) -> list[str]:
     return [name for name in table.columns if name not in AXES or table[name].ne("").any()]
 
 
-def _of_trials(row: RowData, scale: tuple[float, float] | None, report_at: tuple[int, ...]) -> dict[str, str]:
-    quartiles = np.quantile(row.final, [0.25, 0.75])
+def _of_trials(row: RowData, scale: tuple[float, float] | None, data: StudyData) -> dict[str, str]:
+    quartiles, report_at = np.quantile(row.final, [0.25, 0.75]), data.declaration.report_at
     values = [None if row.declared.untrained else row.at(number) for number in report_at]
+    finished, wanted = len(row.final), data.description.get("trials")
     line = dict(zip(AXES, row.declared.levels, strict=True)) | {
-        "trials": str(len(row.final)),
+        "trials": f"{finished} of {wanted}" if isinstance(wanted, int) and finished < wanted else str(finished),
         "answers": f"{np.median(row.used):g}",
         **{
             f"after {number}": MISSING if value is None else _median_and_quartile(value)
@@ -76,6 +80,8 @@ def _of_trials(row: RowData, scale: tuple[float, float] | None, report_at: tuple
         "failed": MISSING,
         "exact interval": MISSING,
     }
+    if left_out := sorted(set(range(data.declaration.seed, max(row.seeds))) - set(row.seeds)):
+        line["seeds left out"] = ", ".join(map(str, left_out))
     level = row.declared.failed_below
     if scale is not None:
         floor, ceiling = scale
@@ -85,53 +91,56 @@ def _of_trials(row: RowData, scale: tuple[float, float] | None, report_at: tuple
             needed = answers_for_good(row.answers, row.values, floor + REACHED * (ceiling - floor))
             line[f"answers to {REACHED} for good"] = _with_bounds(needed, _number)
     if level is not None and not row.declared.untrained:
-        failed = int(np.sum(row.final < level))
+        failed = int(np.sum(~(row.final >= level)))  # a value that is no number is a failure too
         line["failed"] = f"{failed} of {len(row.final)}"
         line["exact interval"] = _bounds(failed_trials(failed, len(row.final)), "{:.2f}")
     return line
 
 
-def _compared(row: RowData, reference: RowData) -> tuple[str, float, str]:
-    """Paired difference to the reference after the most answers that all trials of both gave; p; that number."""
-    shared = sorted(set(row.seeds) & set(reference.seeds))
-    budget = int(min(row.used.min(), reference.used.min()))
+def _compared(row: RowData, reference: RowData | None) -> tuple[dict[str, str], float]:
+    """Paired difference to the reference after the answers that both were allowed, as cells of a line; p."""
+    shared = [] if reference is None else sorted(set(row.seeds) & set(reference.seeds))
+    if reference is None or len(shared) < 2:
+        return {}, np.nan
+    budget = min(row.allowed, reference.allowed)
     both = row.at(budget), reference.at(budget)
-    if not shared or both[0] is None or both[1] is None:
-        return MISSING, np.nan, MISSING
+    if both[0] is None or both[1] is None:
+        return {}, np.nan
     values, before = (
         part[[side.seeds.index(seed) for seed in shared]] for part, side in ((both[0], row), (both[1], reference))
     )
     difference, p = paired_difference(values, before)
-    return _with_bounds(difference, lambda number: f"{number:+.3g}"), p, str(budget)
+    shown = _with_bounds(difference, lambda number: f"{number:+.3g}")
+    return {"pairs": str(len(shared)), "at answers": str(budget), "difference": shown}, p
 
 
 def pairs_table(data: StudyData) -> pd.DataFrame:
-    """Pairs of trials with the first row of the same task: how often one needed fewer answers, and how often more.
+    """Pairs of trials with those of `reference_of`: how often one needed fewer answers, and how often more.
 
     In all; until its kept policy is first better than the task's `good_above`; and until it is for good. No lines where
     no task declares that.
     """
     lines = []
-    for task in data.tasks:
-        learned = [row for row in data.of_task(task) if not row.declared.untrained]
-        for row in learned[1:]:
-            reference, level = learned[0], row.declared.good_above
-            if level is None:
-                continue
-            shared = sorted(set(row.seeds) & set(reference.seeds))
-            places = [[side.seeds.index(seed) for seed in shared] for side in (row, reference)]
-            line = dict(zip(AXES, row.declared.levels, strict=True)) | {"pairs": str(len(shared))}
-            for name, needed in (
-                ("in all", [side.used for side in (row, reference)]),
-                (f"to {level:g}", [_answers_above(side, level) for side in (row, reference)]),
-                (f"to {level:g} for good", [_answers_above(side, level, for_good=True) for side in (row, reference)]),
-            ):
-                mine, its = (part[place] for part, place in zip(needed, places, strict=True))
-                fewer, more = int(np.sum(mine < its)), int(np.sum(mine > its))
-                line |= {f"median {name}": f"{np.median(mine):g} against {np.median(its):g}"}
-                line |= {f"fewer {name}": str(fewer), f"more {name}": str(more)}
-                line |= {f"p {name}": f"{sign_test(fewer, more):.2g}"}
-            lines.append(line)
+    for row in data.rows:
+        declared, level = data.reference_of(row.declared), row.declared.good_above
+        reference = None if declared is None else data.row_of(declared)
+        if declared is None or reference is None or level is None:
+            continue
+        shared = sorted(set(row.seeds) & set(reference.seeds))
+        places = [[side.seeds.index(seed) for seed in shared] for side in (row, reference)]
+        line = dict(zip(AXES, row.declared.levels, strict=True))
+        line |= {"against": _without_task(declared), "pairs": str(len(shared))}
+        for name, needed in (
+            ("in all", [side.used for side in (row, reference)]),
+            (f"to {level:g}", [_answers_above(side, level) for side in (row, reference)]),
+            (f"to {level:g} for good", [_answers_above(side, level, for_good=True) for side in (row, reference)]),
+        ):
+            mine, its = (part[place] for part, place in zip(needed, places, strict=True))
+            fewer, more = int(np.sum(mine < its)), int(np.sum(mine > its))
+            line |= {f"median {name}": f"{_number(np.median(mine))} against {_number(np.median(its))}"}
+            line |= {f"fewer {name}": str(fewer), f"more {name}": str(more)}
+            line |= {f"p {name}": f"{sign_test(fewer, more):.2g}"}
+        lines.append(line)
     table = pd.DataFrame(lines)
     return table.reindex(columns=_present(table)) if len(table) else table
 

@@ -33,14 +33,16 @@ TITLES = {
 
 NOTES = {
     "values": "value of the kept policy at the end of a trial, and after so many answers, median [lower quartile]. "
-    "Relative value: 0 is the random policy, 1 the median of the reference runs on the hidden reward. Difference: "
-    "median paired difference to the first row of the task, after as many answers as all trials of both gave; p values "
-    "(Wilcoxon) are adjusted for the comparisons of the table by Holm, and by Benjamini and Hochberg (false "
+    "Relative value: 0 is the random policy, 1 the median of the reference runs on the hidden reward. Seeds left out: "
+    "their trials met no preference at first and were drawn again, or were given up. Difference: median difference in "
+    "pairs of the same seed, against the first method with the same noise and variant (of the first method: against "
+    "its first noise), after the answers that both were allowed; a trial that ended with fewer keeps its policy. p "
+    "values (Wilcoxon) are adjusted for the comparisons of the table by Holm, and by Benjamini and Hochberg (false "
     "discovery). Brackets elsewhere: 95 % intervals, bootstrap over trials, of failed trials exact (Clopper and "
     "Pearson).",
     "kept": "value, median [lower quartile], of the policy that a run keeps, of its newest, and of the best of the "
     "run, which only the hidden reward knows. Within 3 % of the best: of what that gains over the random policy.",
-    "pairs": "pairs of the same seed, with the first row of the task: in how many the trial needed fewer answers, and "
+    "pairs": "pairs of the same seed: in how many the trial needed fewer answers than the one it is compared with, and "
     "more; in all, until its kept policy is better than the value, and until it stays so. p: two-sided sign tests, not "
     "adjusted for their number.",
     "calibration": "each answer was predicted before it was given. `z` below −2: overconfident, above 2: "

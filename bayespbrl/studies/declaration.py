@@ -12,7 +12,7 @@ minutes = 1.5                    # of a trial on one core, for --dry-run
 failed_below = 150               # a trial that ends below this value has failed
 good_above = 280                 # after how many answers a trial's kept policy is better than this is counted in pairs
 
-[methods.posterior-mean]         # the first row of a task is what its others are compared with
+[methods.posterior-mean]         # the first method is what the others are compared with
 [methods.random-policy]
 untrained = true                 # only the value of the first policy is measured
 
@@ -79,6 +79,11 @@ class DeclaredRow:
     def name(self) -> str:
         """The levels, joined: where the row's run directories are."""
         return "/".join(level for level in self.levels if level)
+
+    @property
+    def of_scale(self) -> bool:
+        """Whether the row is an end of the relative value's scale: the random policy, or learning from the reward."""
+        return self.untrained or self.options.get("utility") == "known-reward"
 
 
 @dataclass(frozen=True)
