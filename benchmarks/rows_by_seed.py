@@ -1,7 +1,7 @@
 """A row of figures a seed, appended to a CSV file as it comes, so that a study that was cut goes on where it was."""
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -20,9 +20,18 @@ def done(file: Path, columns: Sequence[str]) -> list[Row]:
     return [{name: float(row[name]) for name in columns} for row in rows]
 
 
-def run(seeds: Sequence[int], file: Path, columns: Sequence[str], one_run: Callable[[int], Row]) -> list[Row]:
-    """All rows, after the missing runs."""
+def run(
+    seeds: Sequence[int],
+    file: Path,
+    columns: Sequence[str],
+    one_run: Callable[[int], Row],
+    same: Mapping[str, float] | None = None,
+) -> list[Row]:
+    """All rows, after the missing runs; `same` are figures that all have, which the options say."""
     rows = done(file, columns)
+    for name, value in (same or {}).items():
+        if others := sorted({row[name] for row in rows} - {value}):
+            raise SystemExit(f"{file}: expected rows with {name} {value:g}, got {others[0]:g}; choose another --out")
     file.parent.mkdir(parents=True, exist_ok=True)
     with written_aside(file) as aside:
         pd.DataFrame(rows, columns=list(columns)).to_csv(aside, index=False, lineterminator="\r\n")

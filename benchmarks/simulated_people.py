@@ -37,7 +37,7 @@ ANSWERS, HELD_OUT, DIMENSION = 40, 200, 5
 STEEPNESS, THRESHOLD, BIAS_NATS, LAPSE_RATES = 5.0, 1 / 3, 0.5, (0.0, 0.4)
 MODEL = PreferenceModel(steepness=None, lapse_rate=None, likelihood="logistic")
 PREFERRED, DOMINATED = 0, 1
-RESULTS = Path(__file__).parent / "results" / "simulated-people.csv"
+RESULTS = Path(__file__).parent / "results"
 QUANTITIES = ("lapse rate 0", "lapse rate 1", "side bias 0", "side bias 1")
 ENDS = ("true", "mean", "lower", "upper")
 COLUMNS = [
@@ -171,7 +171,8 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--drawn", action="store_true", help="draw the people from the priors")
     parser.add_argument("--seed", type=int, default=4000)
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path)
     chosen = parser.parse_args()
+    out = chosen.out or RESULTS / f"simulated-people{'-drawn' if chosen.drawn else ''}.csv"
     seeds = range(chosen.seed, chosen.seed + chosen.runs)
-    show(run(seeds, chosen.out, COLUMNS, partial(one_run, drawn=chosen.drawn)))
+    show(run(seeds, out, COLUMNS, partial(one_run, drawn=chosen.drawn)))

@@ -74,4 +74,4 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=RESULTS)
     chosen = parser.parse_args()
     seeds = range(chosen.seed, chosen.seed + chosen.runs)
-    show(run(seeds, chosen.out, COLUMNS, partial(one_run, wrong=chosen.wrong)))
+    show(run(seeds, chosen.out, COLUMNS, partial(one_run, wrong=chosen.wrong), {"wrong": chosen.wrong}))

@@ -108,71 +108,6 @@ def test_the_posterior_of_many_answers_is_timed_beside_that_of_nuts(tmp_path, pr
     assert np.all(np.abs(of_both[0].mean((0, 1)) - of_both[1].mean((0, 1))) < 4 * error)
 
 
-def test_studies_are_compared_seed_by_seed(tmp_path, printed):
-    curves = {"first": {1: [0, 10, 20], 2: [0, 0, 4], 3: [0, 10, 12]}, "second": {3: [0, 20, 22], 1: [10, 20, 25]}}
-    curves["longer"] = {seed: [*values, -999] for seed, values in curves["second"].items()}
-    curves["asks-less"] = curves["second"]  # after its first two answers it asks nothing more
-    for name, trials in curves.items():
-        asked = name != "asks-less"
-        rows = [
-            f"{seed},{i + 1},{2 + i * asked},{value}"
-            for seed, values in trials.items()
-            for i, value in enumerate(values)
-        ]
-        (tmp_path / f"{name}.csv").write_text("\n".join(["seed,iteration,answers,value", *rows]))
-    # one of three asks nothing more; they are compared after the two answers that all have
-    uneven = ["1,1,2,5", "1,2,2,30", "2,1,2,5", "2,2,3,40", "3,1,2,5", "3,2,3,50"]
-    (tmp_path / "uneven.csv").write_text("\n".join(["seed,iteration,answers,value", *uneven]))
-    curves["uneven"] = {}
-    studies = [tmp_path / f"{name}.csv" for name in curves]
-    options = ["--floor", "0", "--ceiling", tmp_path / "second.csv", "--lost", "10"]
-    lines = printed("compare", *studies, *options)
-    assert lines[0] == "relative value 0.95: 22.32"  # 0.95 of the median of 22 and 25
-    first, second, longer, less, uneven = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
-    never = "never [never, never]"
-    assert first == ["first", "3", "12 [8]", "1", never, never, "never; never", "–", "4", "–", "–"]
-    # seeds 3 and 1 differ by 10 and 5, in the second study's order as in any other
-    # drawn twice, seed 3 alone is never at the line
-    reached = ["4 [4, never]", "4 [4, never]", "3; 3", "–"]
-    assert second == ["second", "2", "23.5 [22.75]", "0", *reached, "4", *2 * ["+7.5 [+5.0, +10.0]"]]
-    # a longer study is compared with the first at the answers that both have
-    assert longer[:-1] == ["longer", "2", "-999 [-999]", "2", *reached, "5", "+7.5 [+5.0, +10.0]"]
-    assert longer[-1] == "-1015.0 [-1019.0, -1011.0]"
-    # what it learns without asking counts for the answers before: 22 and 25 after two, where the first study has 0
-    reached = ["2 [2, never]", "2 [2, never]", "3; 3", "–"]
-    assert less == ["asks-less", "2", "23.5 [22.75]", "0", *reached, "2", "+23.5 [+22.0, +25.0]", second[-1]]
-    # after two answers 30, 5 and 5, where the first study has 0 each; at the end 30, 40, 50, where it has 20, 4, 12
-    assert uneven[0] == "uneven"
-    assert uneven[-3:] == ["3", "+5.0 [+5.0, +30.0]", "+36.0 [+10.0, +38.0]"]
-
-
-def test_studies_of_different_seeds_are_joined_and_their_answers_are_shares(tmp_path, printed, capsys):
-    header = "seed,iteration,answers,value"
-    at = {"soon": [(1, 2), (2, 2)], "later": [(3, 2), (4, 3)], "slow": [(seed, 3) for seed in range(1, 5)]}
-    for name, trials in at.items():
-        rows = [f"{seed},{i},{i + 1},{i >= reached:d}" for seed, reached in trials for i in range(1, 5)]
-        (tmp_path / f"{name}.csv").write_text("\n".join([header, *rows]))
-    with (tmp_path / "later.csv").open("a") as longer:
-        longer.write("\n3,5,6,-1\n4,5,6,-1")  # an iteration that not all have
-    joined = f"{tmp_path / 'soon.csv'}+{tmp_path / 'later.csv'}"
-    options = ["--floor", "0", "--ceiling", "1"]
-    lines = printed("compare", *options, joined, tmp_path / "slow.csv")
-    both, slow = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[3:])
-    assert both[:3] == ["soon+later", "4", "1 [1]"]
-    # after 3 answers three of the four trials are there: their lower quartile is 0.75, drawn anew often 1
-    assert both[-7:-3] == ["3 [3, 4]", "4 [3, 4]", "2; 3", "–"]
-    assert slow[-7:-3] == ["4 [4, 4]", "4 [4, 4]", "3; 3", "1.00 [0.75, 1.00]"]
-    (tmp_path / "late.csv").write_text("\n".join([header, "1,1,9,1", "2,1,9,1"]))
-    lines = printed("compare", *options, joined, tmp_path / "late.csv")
-    assert lines[-1].startswith("| late | 2 | – | – | 1 [1] | – | 9 [9, 9] |")
-    twice = f"{tmp_path / 'soon.csv'}+{tmp_path / 'slow.csv'}"
-    with pytest.raises(SystemExit) as refused:
-        printed("compare", *options, twice)
-    assert refused.value.code == 2
-    assert "error: " in (stderr := capsys.readouterr().err)
-    assert "expected tables with different seeds, got seed 1 twice" in stderr
-
-
 def test_the_index_of_the_results_names_every_file_once_and_nothing_else():
     results = BENCHMARKS / "results"
     named = re.findall(r"^\| \[([^\]]+)\]\(\1\) \|", (results / "README.md").read_text(), flags=re.MULTILINE)
@@ -268,6 +203,8 @@ def test_rows_by_seed_go_on_where_they_were_cut(tmp_path):
     assert rows == [{"seed": 5, "square": 25}, {"seed": 6, "square": 36}] == rows_by_seed.done(file, columns)
     assert computed == [5, 6]
     assert rows_by_seed.run([6], file, columns, square) == rows[1:]
+    with pytest.raises(SystemExit, match="expected rows with square 36, got 25; choose another --out"):
+        rows_by_seed.run([6], file, columns, square, {"square": 36})
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from test_trials import ThisProcess, without_processes
 import bayespbrl
 from bayespbrl.results.study_data import read_study
 from bayespbrl.runs import run as runs
+from bayespbrl.runs.lock import continuing
 from bayespbrl.studies import Study, declared, rows
 from bayespbrl.studies.cluster import scheduler_executor
 from bayespbrl.studies.declaration import parsed, shipped
@@ -112,6 +113,47 @@ def test_a_second_call_computes_nothing_again_and_more_trials_may_follow(finishe
         (finished / "iterations.csv").read_text().split("\n")[1].split(",")[:7]
     )
     assert Study.prepare(parsed(DECLARATION, "tiny"), copy, trials=3).finished == 6
+    with pytest.raises(
+        ValueError, match=r"trials: expected more than 1, of which .*linear-program.* has finished more"
+    ):
+        Study.prepare(parsed(DECLARATION, "tiny"), copy, trials=1)
+
+
+def test_a_damaged_trial_is_given_up_and_the_others_go_on(finished, tmp_path, monkeypatch):
+    without_processes(monkeypatch)
+    copy = shutil.copytree(finished, tmp_path / "study")
+    (copy / "gridworld/linear-program/none/seed-2980/settings.json").write_text("")
+    shutil.rmtree(copy / "gridworld/linear-program/none/seed-2981")
+    study = Study.prepare(parsed(DECLARATION, "tiny"), copy)
+    (failure,) = study.run()
+    assert "linear-program/none seed 2980" in str(failure)
+    assert "settings.json" in str(failure)
+    assert study.finished == 5
+    assert len(read_study(copy).rows) == 3
+
+
+def test_a_trial_that_another_program_runs_is_left_to_it(tmp_path):
+    row = row_of("gridworld", tmp_path, TINY, seed=2980)
+    runs.start("gridworld", row.path(2980), **TINY, seed=2980)
+    with continuing(row.path(2980)), pytest.raises(ValueError, match="expected a run that no other program continues"):
+        run_trial(row, 2980)
+    assert not (row.path(2980) / "events.jsonl").exists()
+    assert run_trial(row, 2980)
+
+
+def test_a_study_that_was_killed_as_it_began_can_be_begun_again(tmp_path):
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "study.toml").write_text(DECLARATION)
+    assert Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "study").finished == 0
+
+
+def test_the_time_of_a_baseline_is_known(tmp_path, monkeypatch):
+    without_processes(monkeypatch)
+    text = DECLARATION.split("[methods")[0].replace("minutes = 2", "") + "[methods.pf]\nbaseline = 'pf'"
+    study = Study.prepare(parsed(text, "tiny"), tmp_path / "study", trials=1)
+    assert study.minutes_left() is None
+    assert study.run() == []
+    assert Study.prepare(parsed(text, "tiny"), tmp_path / "study", trials=2).minutes_left() > 0
 
 
 def test_a_finished_study_keeps_where_it_is_from_and_a_continued_one_names_both(finished, tmp_path, monkeypatch):
@@ -154,7 +196,7 @@ BAD = [
     ("[tasks]", "at least one task"),
     ("trials = 0\n[tasks.gridworld]", "trials: expected a whole number >= 1"),
     ("[tasks.gridworld]\nspeed = 3", "tasks.gridworld: expected entries among .*, got speed"),
-    ("[tasks.gridworld]\nminutes = 'long'", "minutes: expected a finite number"),
+    ("[tasks.gridworld]\nminutes = 'long'", "minutes: expected a positive finite number"),
     ("[options]\nseed = 4\n[tasks.gridworld]", "options: expected entries among .*, got seed"),
     ("levels = 3\n[tasks.gridworld]", "expected entries among .*, got levels"),
     ("[tasks.gridworld]\n[noise]\nfew = 3", "noise.few: expected a table, got 3"),
@@ -163,6 +205,15 @@ BAD = [
     ("leave_out = 5\n[tasks.gridworld]", "leave_out: expected a list of tables, got 5"),
     ("[tasks.gridworld]\n[[leave_out]]\ntasks = [['a']]", "leave_out: expected a list of tasks among gridworld"),
     ("[tasks.'../up']", "expected a name of letters"),
+    ("[tasks.'study.json']", "expected a name of letters"),
+    ("[tasks.gridworld]\nminutes = -5", "minutes: expected a positive finite number, got -5"),
+    ("[tasks.gridworld]\nenv = ''", "env: expected a short name or a gymnasium id, got ''"),
+    ("[tasks.gridworld]\nminute = 5", "expected entries among env, minutes, failed_below, .*, got minute"),
+    (
+        "[tasks.gridworld]\n[methods.pf]\nbaseline = 'pf'\nuntrained = true",
+        "expected untrained or a baseline",
+    ),
+    ("[tasks.gridworld]\n[[leave_out]]\ntasks = []", "leave_out: expected a list of tasks among gridworld"),
 ]
 
 
@@ -327,6 +378,12 @@ def test_a_cluster_that_loses_a_worker_loses_no_trial_and_computes_nothing_twice
     assert run_trial(alone, 6)
     kept, again = (runs.load(tmp_path / name / "seed-6").iterations for name in ("row", "alone"))
     assert [entry["value"] for entry in kept] == [entry["value"] for entry in again]
+
+
+@pytest.mark.parametrize("part", ["query", "schedule", "policy"])
+def test_a_row_needs_parts_that_the_package_has(tmp_path, part):
+    with pytest.raises(ValueError, match=f"{part}: expected one that the package has"):
+        row_of("gridworld", tmp_path, {part: "other"}, seed=2980)
 
 
 def test_a_row_needs_a_simulated_expert(tmp_path):

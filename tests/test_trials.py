@@ -22,7 +22,7 @@ from bayespbrl import ReturnExpert, load, resume, start
 from bayespbrl.rollouts import returns
 from bayespbrl.studies import Trials, rows, run_trials
 from bayespbrl.studies import trials as trials_module
-from bayespbrl.studies.tables import COLUMNS, collect
+from bayespbrl.studies.tables import COLUMNS, collect, write_tables
 
 QUICK = SHORT | {"utility": "linear-program", "iterations": 2}
 
@@ -139,6 +139,12 @@ def test_a_run_that_ends_earlier_keeps_its_last_figures(tmp_path):
     np.testing.assert_array_equal(table["value"].sel(seed=2), [21, 21, 21])
     np.testing.assert_array_equal(table["value"].sel(seed=1), [11, 12, 13])
     np.testing.assert_array_equal(table["seconds_utility"].sel(seed=2), [1, np.nan, np.nan])
+    write_tables(table.assign(value_newest=table["value"]), tmp_path)
+    with (tmp_path / "trials.csv").open() as file:  # only what took place
+        assert [(row["seed"], row["iteration"]) for row in csv.DictReader(file)] == [
+            ("2", "1"),
+            *(("1", str(iteration)) for iteration in (1, 2, 3)),
+        ]
 
 
 def test_a_trial_is_the_run_of_its_seed(study, tmp_path):

@@ -11,6 +11,8 @@ Decisions, where the sources are silent or differ:
 * Observations are numbered by a grid of equal cells, actions are the least, the middle and the greatest.
 * n counts the cells that both trajectories visited, whichever actions they took there.
 * The mean over all pairs of visits of a cell is one sample for it.
+* At a preference the gains of EXP3 grow for every action of every cell by its value over its probability. EXP3 itself
+  does so for the action that was drawn; its gains then settle at more exploitation than these.
 * A tie changes nothing.
 * After an answer the learner would act by the greedy policy, any of the best actions with equal probability.
 * Learning rate, exploration and the number of cells were chosen among a few on seeds 0 to 7, after 75 answers.

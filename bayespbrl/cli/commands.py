@@ -280,7 +280,7 @@ def results(
     """Write tables (Markdown, CSV) and figures of studies, with intervals and counted comparisons."""
     from bayespbrl.results import write_results
 
-    names = [directory.absolute().name for directory in directories]
+    names = [directory.resolve().name for directory in directories]
     if out is not None and (again := sorted({name for name in names if names.count(name) > 1})):
         raise ValueError(
             f"out: expected studies in directories of different names, got {', '.join(again)} more than once"

@@ -19,6 +19,7 @@ from bayespbrl.runs.files import write_file
 from bayespbrl.runs.film import film_policy
 from bayespbrl.runs.simulated import expert_of
 from bayespbrl.studies import Trials
+from bayespbrl.studies.tables import took_place
 from bayespbrl.trajectories import Trajectory
 
 console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may contain square brackets
@@ -253,11 +254,12 @@ def _print_balancing(survival: xr.DataArray, steps: xr.DataArray) -> None:
 
 def _print_numerics(table: xr.Dataset) -> None:
     """How closely the updates met their bounds and constraints, and whether the fits converged."""
-    active = table["bound_active"].values.astype(bool)
+    had = took_place(table).values
+    active = had & table["bound_active"].values.astype(bool)
     deviation = abs(table["kl"] / table["kl_bound"] - 1).values[active].max(initial=0.0)
-    failed = np.sum(~table["utility_converged"].values.astype(bool))
+    failed = np.sum(had & ~table["utility_converged"].values.astype(bool))
     console.print(
-        f"KL bound active in {active.sum()} of {active.size} iterations and met there within {deviation:.2%}; "
+        f"KL bound active in {active.sum()} of {had.sum()} iterations and met there within {deviation:.2%}; "
         f"feature gap at most {float(table['feature_gap'].max()):.1e} whitened, "
         f"{float(table['feature_gap_raw'].max()):.1e} raw; rank kept {int(table['rank_kept'].min())} to "
         f"{int(table['rank_kept'].max())}; utility fits that did not converge: {failed}."

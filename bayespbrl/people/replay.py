@@ -37,25 +37,28 @@ def replayed(
     try:
         env = rendering(environment)
     except Exception as error:  # whatever an environment of the user's raises: there are plots
-        return _told(environment, checks.reason(error))
+        _warn(environment, checks.reason(error))
+        return None
     wanted, pictures = set(map(int, shown)), []
     try:
         for step, same in enumerate(_observed(env, learner.cycle.reset_seed(number), trajectory)):
             if not same:
-                return _told(environment, "reset with the same seed, it does not repeat its episode")
+                _warn(environment, "reset with the same seed, it does not repeat its episode")
+                return None
             if step in wanted:
                 pictures.append(Image.fromarray(rendered_frame(env)))
             if len(pictures) == len(wanted):
                 break
     except Exception as error:  # as above
-        return _told(environment, checks.reason(error))
+        _warn(environment, checks.reason(error))
+        return None
     finally:
         if env is not environment:
             env.close()
     return pictures
 
 
-def _told(environment: gymnasium.Env, reason: str) -> None:
+def _warn(environment: gymnasium.Env, reason: str) -> None:
     """Say why there are no pictures of what should render."""
     warnings.warn(f"{environment_name(environment)} is not rendered but plotted: {reason}", stacklevel=2)
 

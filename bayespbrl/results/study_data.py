@@ -150,7 +150,9 @@ def read_study(directory: Path | str) -> StudyData:
     directory = Path(directory)
     description = read_study_json(directory)
     declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
-    lines = _read(directory / "iterations.csv", ITERATION_COLUMNS)
+    if not (table := directory / "iterations.csv").exists():
+        raise ValueError(f"{directory}: expected finished trials, got none: there is no iterations.csv yet")
+    lines = _read(table, ITERATION_COLUMNS)
     answers = directory / "answers.csv"
     rows = []
     for declared in declaration.rows:

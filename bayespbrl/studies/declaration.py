@@ -47,7 +47,7 @@ OF_A_LEVEL = {
     "methods": ("untrained", "baseline", "minutes"),
     "variants": ("minutes",),
 }
-LEVEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+LEVEL = re.compile(r"(?!.*\.(?:csv|json|md|png|toml)$)[A-Za-z0-9][A-Za-z0-9._-]*")  # no file of the study's
 Options = Mapping[str, Any]
 
 
@@ -176,14 +176,18 @@ def _axis(where: str, axis: str, content: Mapping[str, Any]) -> dict[str, Option
         place = f"{where}, {axis}.{level}"
         if not LEVEL.fullmatch(level):
             raise ValueError(f"{place}: expected a name of letters, digits, dots and dashes, got {level!r}")
-        own = OF_A_LEVEL.get(axis, ())
-        _options(place, {name: value for name, value in _table(place, options).items() if name not in own})
-        for name in {"minutes", "failed_below", "good_above"} & set(options):
+        _options(place, _table(place, options), OF_A_LEVEL.get(axis, ()))
+        for name in {"failed_below", "good_above"} & set(options):
             checks.number(f"{place}, {name}", options[name])
-        if not isinstance(options.get("env", ""), str) or not isinstance(options.get("untrained", False), bool):
-            raise ValueError(f"{place}: expected env as text and untrained as true or false, got {dict(options)}")
+        if "minutes" in options:
+            checks.positive(f"{place}, minutes", options["minutes"])
+        if not isinstance(env := options.get("env", level), str) or not env:
+            raise ValueError(f"{place}, env: expected a short name or a gymnasium id, got {env!r}")
+        untrained = checks.boolean(f"{place}, untrained", options.get("untrained", False))
         if "baseline" in options:
             checks.one_of(f"{place}, baseline", options["baseline"], tuple(BASELINES))
+            if untrained:
+                raise ValueError(f"{place}: expected untrained or a baseline, got both")
     return dict(levels) or {"": {}}
 
 
@@ -198,9 +202,9 @@ def _known(where: str, given: Mapping[str, Any], known: tuple[str, ...]) -> None
         raise ValueError(f"{where}: expected entries among {', '.join(known)}, got {', '.join(unknown)}")
 
 
-def _options(where: str, options: dict[str, Any]) -> dict[str, Any]:
-    """Options of a run; the environment and the seed have their own places."""
-    _known(where, options, tuple(name for name in sorted(OPTIONS) if name not in ("seed", "environment")))
+def _options(where: str, options: dict[str, Any], own: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Options of a run and a level's own; the environment and the seed have their own places."""
+    _known(where, options, (*own, *(name for name in sorted(OPTIONS) if name not in ("seed", "environment"))))
     return options
 
 
@@ -211,7 +215,7 @@ def _left_out(where: str, entry: Any, axes: list[dict[str, Options]]) -> list[li
     chosen = []
     for axis, levels in zip(AXES, axes, strict=True):
         names = entry.get(axis, list(levels))
-        if not isinstance(names, list) or any(name not in list(levels) for name in names):
+        if not isinstance(names, list) or not names or any(name not in list(levels) for name in names):
             raise ValueError(f"{place}: expected a list of {axis} among {', '.join(levels)}, got {names!r}")
         chosen.append(names)
     return chosen

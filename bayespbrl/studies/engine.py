@@ -98,6 +98,7 @@ class Engine:
             (seed - row.row.settings.seed, place, seed) for place, row in enumerate(self.rows) for seed in row.to_do()
         ]
         given_up = [Failure(row.row, row.row.settings.seed, row.exhausted) for row in self.rows if row.exhausted]
+        given_up += [Failure(row.row, *damage) for row in self.rows for damage in row.damaged.items()]
         self.failures += [failure for failure in given_up if failure not in self.failures]
         for _, place, seed in sorted(new):
             if (place, seed) not in self._starts:

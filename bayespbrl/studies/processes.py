@@ -106,7 +106,9 @@ def _serve(calls: Connection) -> None:
 
 def _plain(error: Exception) -> Exception:
     """An error of a subclass, as what can be sent."""
-    return OSError(*error.args) if isinstance(error, OSError) else ValueError(str(error))
+    if not isinstance(error, OSError):
+        return ValueError(str(error))
+    return OSError(*error.args) if error.filename is None else OSError(*error.args[:2], error.filename)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from bayespbrl.experts import SIMULATED
 from bayespbrl.learner import Learner
 from bayespbrl.runs import run as runs
 from bayespbrl.runs.directory import RunDirectory, read_summary
+from bayespbrl.runs.lock import continuing
 from bayespbrl.runs.simulated import expert_of
 from bayespbrl.settings import Settings, Task, settings_for
 from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
@@ -32,6 +33,10 @@ PREFERENCE_WITHIN = {"bayespbrl/Acrobot-v0": 3}
 # The most steps of an episode for the balancing time of the final policy, where the task is to stay upright.
 BALANCING_STEPS = {"bayespbrl/Bicycle-v0": 3000}
 MOST_SEEDS_A_TRIAL = 10  # a study gives up after this many seeds per trial: preferences are too rare there
+
+
+class DamagedTrial(ValueError):
+    """A trial on disk that cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -67,17 +72,21 @@ class Row:
         """Whether a trial on disk counts (True) or is redrawn (False); None for one that is not finished.
 
         Raises:
-          ValueError: a run with other settings, or a directory that is no run.
+          DamagedTrial: one that cannot be read, or a directory that is no run.
+          ValueError: a run with other settings.
         """
         path = self.path(seed)
         if not path.exists():
             return None
-        kept = RunDirectory.open(path)
+        try:
+            kept = RunDirectory.open(path)
+            done = read_summary(path)["iterations"] if (path / "summary.json").exists() else []
+        except ValueError as error:
+            raise DamagedTrial(str(error)) from error
         if kept.settings != replace(self.settings, seed=seed):
             raise ValueError(f"{path}: expected a trial with these settings, got others: {kept.settings}")
         if self.untrained or self.baseline is not None:
             return True if (path / (FIRST_POLICY_FILE if self.untrained else BASELINE_FILE)).exists() else None
-        done = read_summary(path)["iterations"] if (path / "summary.json").exists() else []
         if done and self.redraws(len(done), done[-1]["pairs"]):
             return False
         measured = self.balancing_steps is None or (path / BALANCING_FILE).exists()
@@ -101,7 +110,7 @@ def row_of(
     """A row, its settings completed and checked; its first trial has `seed`.
 
     Raises:
-      ValueError: an unknown environment, a bad option, or an expert that is not simulated.
+      ValueError: an unknown environment, a bad option, an expert that is not simulated, or parts of the user's.
     """
     if directory.exists() and not directory.is_dir():
         raise ValueError(f"{directory}: expected a directory for the trials, got a file")
@@ -112,6 +121,10 @@ def row_of(
     environment.close()
     if first.expert not in SIMULATED:
         raise ValueError(f"expert: expected one of {', '.join(SIMULATED)}, which are simulated, got {first.expert!r}")
+    if first.own_parts:
+        raise ValueError(
+            f"{first.own_parts[0]}: expected one that the package has, got 'other', which only code passes"
+        )
     within = PREFERENCE_WITHIN.get(identity) if preference_within is None else preference_within
     balancing = BALANCING_STEPS.get(identity)
     return Row(env, directory, first, dict(options), within, balancing, untrained, name)
@@ -127,6 +140,7 @@ class Seeds:
     row: Row
     trials: int
     outcomes: dict[int, bool | None] = field(default_factory=dict)
+    damaged: dict[int, str] = field(default_factory=dict)
     exhausted: str = ""
 
     def with_outcome(self, outcome: bool | None) -> list[int]:
@@ -142,26 +156,36 @@ class Seeds:
                 )
                 return []
             seed = self.row.settings.seed + len(self.outcomes)
-            self.outcomes[seed] = self.row.outcome(seed)
-        return self.with_outcome(None)
+            try:
+                self.outcomes[seed] = self.row.outcome(seed)
+            except DamagedTrial as error:
+                self.outcomes[seed], self.damaged[seed] = None, str(error)
+        return [seed for seed in self.with_outcome(None) if seed not in self.damaged]
 
 
 def run_trial(row: Row, seed: int) -> bool:
     """Run one trial to its end, from where it stopped if it was begun; returns whether it counts.
 
     One that another process has finished in the meantime is left as it is.
+
+    Raises:
+      ValueError: another process runs it.
     """
     path = row.path(seed)
     if (known := row.outcome(seed)) is not None:
         return known
-    learner = runs.resume(path, env=row.env) if path.exists() else runs.start(row.env, path, **row.options, seed=seed)
-    if row.untrained:
-        measure_first_policy(learner, path)
-        return True
-    if row.baseline is not None:
-        measure_baseline(learner, row.baseline, path)
-        return True
-    return _trained(row, learner, path)
+    begun = None if path.exists() else runs.start(row.env, path, **row.options, seed=seed)
+    with continuing(path):
+        if (known := row.outcome(seed)) is not None:
+            return known
+        learner = runs.resume(path, env=row.env) if begun is None else begun
+        if row.untrained:
+            measure_first_policy(learner, path)
+            return True
+        if row.baseline is not None:
+            measure_baseline(learner, row.baseline, path)
+            return True
+        return _trained(row, learner, path)
 
 
 def _trained(row: Row, learner: Learner, path: Path) -> bool:
@@ -179,10 +203,11 @@ def _redraws(row: Row, learner: Learner) -> bool:
     return row.redraws(learner.state.iteration, len(learner.preferences.pairs))
 
 
-def seconds_of(directory: Path) -> float | None:
+def seconds_of(row: Row, seed: int) -> float | None:
     """The seconds that a finished trial took, without waiting for answers; None where that is not kept."""
+    read = read_summary if row.baseline is None else read_baseline
     try:
-        taken = [entry["seconds"] for entry in read_summary(directory)["iterations"]]
+        taken = [entry["seconds"] for entry in read(row.path(seed))["iterations"]]
         return float(sum(sum(entry.values()) for entry in taken))
     except (ValueError, KeyError, TypeError, AttributeError, json.JSONDecodeError):
         return None

@@ -25,6 +25,7 @@ from bayespbrl.studies.declaration import AXES, Declaration, parsed
 from bayespbrl.studies.engine import Engine, Failure, Progress
 from bayespbrl.studies.machine import machine, rounding, source_digest
 from bayespbrl.studies.rows import Seeds, collected, row_of, seconds_of
+from bayespbrl.studies.tables import took_place
 from bayespbrl.studies.trials import executor_for
 
 FIGURES = {
@@ -71,7 +72,7 @@ class Study:
 
         Raises:
           ValueError: a bad option or an unknown task, by its row; a directory of something else, of other settings or
-            of another version.
+            of another version; fewer trials than are finished.
         """
         directory = Path(directory)
         number = declaration.trials if trials is None else checks.whole("trials", trials)
@@ -91,6 +92,7 @@ class Study:
                 raise ValueError(f"study {declaration.name}, {declared.name}: {error}") from error
             seeds = Seeds(replace(row, baseline=declared.baseline), number)
             seeds.to_do()
+            _check_no_more(seeds)
             rows.append(seeds)
         return cls(declaration, directory, number, rows)
 
@@ -112,7 +114,7 @@ class Study:
         total = 0.0
         for declared, row in zip(self.declaration.rows, self.rows, strict=True):
             left = self.trials - len(row.with_outcome(True))
-            known = [seconds_of(row.row.path(seed)) for seed in row.with_outcome(True)]
+            known = [seconds_of(row.row, seed) for seed in row.with_outcome(True)]
             took = [seconds / 60 for seconds in known if seconds is not None]
             each = 0.0 if declared.untrained else fmean(took) if took else declared.minutes
             if left and each is None:
@@ -146,9 +148,7 @@ class Study:
 
     def _write_declaration(self, command: str) -> None:
         """`study.toml` and `study.json`, which keeps where earlier cells are from, if from elsewhere."""
-        self.directory.mkdir(parents=True, exist_ok=True)
         before = read_study_json(self.directory) if self.finished else {}
-        write_file(self.directory / "study.toml", self.declaration.text)
         content: dict[str, Any] = {
             "study": self.declaration.name,
             "title": self.declaration.title,
@@ -166,6 +166,8 @@ class Study:
             earlier.append({name: before.get(name) for name in (*WHENCE, "command", "date")})
         if earlier:
             content["earlier"] = earlier
+        self.directory.mkdir(parents=True, exist_ok=True)
+        write_file(self.directory / "study.toml", self.declaration.text)
         write_file(self.directory / "study.json", json.dumps(content, indent=1) + "\n")
 
     def write_table(self) -> None:
@@ -188,8 +190,8 @@ def _table_of(levels: tuple[str, ...], seeds: Seeds) -> pd.DataFrame:
     present = {column: name for column, name in FIGURES.items() if name in table}
     lines = table[list(present.values())].to_dataframe(["seed", "iteration"]).reset_index()
     lines = lines.rename(columns={name: column for column, name in present.items()})
-    if "seconds" in lines:  # an iteration that a trial did not have took none
-        lines = lines[lines["seconds"].notna()]
+    if "seconds" in lines:
+        lines = lines[took_place(table).values.ravel()]
     lines = lines.astype({"answers": int} | ({"converged": bool} if "converged" in lines else {}))
     for place, (axis, level) in enumerate(zip(AXES, levels, strict=True)):
         lines.insert(place, axis, level)
@@ -202,7 +204,7 @@ def _check_same(declaration: Declaration, directory: Path) -> None:
         return
     if not directory.is_dir():
         raise ValueError(f"{directory}: expected a directory for the study, got a file")
-    if not any(directory.iterdir()):
+    if {path.name for path in directory.iterdir()} <= {"study.toml"}:  # empty, or stopped as it began
         return
     kept = read_study_json(directory)
     if kept.get("version") != version("bayespbrl"):
@@ -216,6 +218,14 @@ def _check_same(declaration: Declaration, directory: Path) -> None:
             f"{directory}: expected the study {declaration.name} as it is declared now, got another: "
             f"{kept.get('study')}; choose another --out"
         )
+
+
+def _check_no_more(seeds: Seeds) -> None:
+    """Check that a row has no more finished trials than it is to have: the table would lose them."""
+    row = seeds.row
+    beyond = row.settings.seed + len(seeds.outcomes)
+    if row.path(beyond).exists() and row.outcome(beyond):
+        raise ValueError(f"trials: expected more than {seeds.trials}, of which {row.name} has finished more already")
 
 
 def _settled(declaration: Declaration) -> tuple[Any, ...]:

@@ -51,6 +51,11 @@ def collect(
     return xr.Dataset(variables, {"seed": seeds, "iteration": iterations}, attributes)
 
 
+def took_place(table: xr.Dataset) -> xr.DataArray:
+    """Which trials had which iterations, (seed, iteration) bool: those that were to come have no seconds."""
+    return table["seconds_utility"].notnull()
+
+
 def by_answers(answers: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values by the number of answers, for trials whose iterations ask different numbers of questions.
 
@@ -126,17 +131,18 @@ def collect_first_policies(directories: Sequence[Path | str], env: str) -> xr.Da
 
 
 def write_tables(table: xr.Dataset, directory: Path) -> None:
-    """Write `trials.csv`, one row per trial and iteration, and `trials.nc`, each whole or not at all.
+    """Write `trials.csv`, one row per trial and iteration that it had, and `trials.nc`, each whole or not at all.
 
     Where a balancing time was measured there are three more columns: the share of evaluation episodes that survive, and
     the balancing time of the final policy in steps and in seconds, in the row of the last iteration.
     """
-    rows = table[["answers", "value", "value_newest"]].to_dataframe(["seed", "iteration"]).reset_index()
+    names, had = ["answers", "value", "value_newest"], took_place(table).values.ravel()
+    rows = table[names].to_dataframe(["seed", "iteration"]).reset_index()[had]
     rows = rows.astype({"answers": int}).assign(env=table.attrs["env"], utility=table.attrs["utility"])[[*COLUMNS]]
     if "balancing_steps" in table:
-        last = rows["iteration"] == rows["iteration"].max()
+        last = ~rows.duplicated("seed", keep="last")
         steps = rows["seed"].map(table["balancing_steps"].to_series())
-        rows["survival"] = [f"{share:g}" for share in (1 - table["terminated"]).values.ravel()]
+        rows["survival"] = [f"{share:g}" for share in (1 - table["terminated"]).values.ravel()[had]]
         rows["balancing_steps"] = steps.where(last)
         rows["balancing_seconds"] = [round(number * bicycle.STEP_SECONDS, 6) for number in rows["balancing_steps"]]
     write_file(directory / "trials.csv", rows.to_csv(index=False, lineterminator="\r\n"))
