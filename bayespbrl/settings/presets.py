@@ -87,7 +87,7 @@ KEPT = (
 TASKS = {
     task: {name: PAPER[task][name] for name in KEPT if name in PAPER[task]}
     | {"updates_per_iteration": 3, "trajectories_per_iteration": 10, "check_episodes": check_episodes}
-    for task, check_episodes in (("gridworld", 40), ("swing-up", 8), ("bicycle", 8), ("acrobot", 40))
+    for task, check_episodes in (("gridworld", 40), ("swing-up", 8), ("bicycle", 40), ("acrobot", 40))
 }
 # An environment object of the user's is known by its gymnasium id.
 IDS = {identity: short for short, identity in SHORT_NAMES.items()}
