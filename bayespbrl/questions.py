@@ -148,14 +148,20 @@ def repeated(
     Args:
       past: the questions so far that were answered.
       left: answers of the budget that nothing else is wanted for.
-      rng: chooses among one person's that have not been repeated, without the last few; among all people's where
-        repeats are shared.
+      rng: chooses among one person's that have not been repeated, without the last few of all and of that person; among
+        all people's where repeats are shared.
       answerer: who is asked, since only who answered a question can be consistent; None: whoever answered last.
     """
     done = {question.repeats for question in past}
     if len(done - {None}) >= int(options.repeats * number + 1e-9) or left < 1:
         return None
-    new = [each for each in past[:-LEAST_BETWEEN] if each.repeats is None and each.answer is not Answer.SKIP]
     person = past[-1].answerer if past and answerer is None else answerer
-    suitable = [each for each in new if each.number not in done and (options.shared_repeats or each.answerer == person)]
+    seen = [each.number for each in past if each.answerer == person]
+    recent = {*seen[-LEAST_BETWEEN:], *(each.number for each in past[-LEAST_BETWEEN:])}
+    suitable = [
+        each
+        for each in past
+        if each.repeats is None and each.answer is not Answer.SKIP and each.number not in done | recent
+        if options.shared_repeats or each.answerer == person
+    ]
     return suitable[rng.integers(len(suitable))] if suitable else None

@@ -11,9 +11,9 @@ from bayespbrl.checks import finite
 DISCOUNT = 0.98  # γ of Q, and of ψ(τ) where no learner says otherwise; the paper's
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Trajectory:
-    """One trajectory of T steps; lists become arrays.
+    """One trajectory of T steps; lists become arrays. It equals itself alone.
 
     Attributes:
       states: s₀ … s_T as observed; shape (T+1, S) float64, or (T+1,) int64 where observations are discrete.
@@ -36,7 +36,10 @@ class Trajectory:
             finite(f"trajectory: {name}", given)
             if np.ndim(given) == 0:
                 raise ValueError(f"trajectory: {name}: expected one entry for each step, got {given!r}")
-            object.__setattr__(self, name, np.asarray(given))  # how a frozen dataclass sets an attribute
+            values = np.asarray(given)
+            whole = values.dtype.kind in "iub" and (values.ndim == 2 or name == "rewards")
+            # how a frozen dataclass sets an attribute
+            object.__setattr__(self, name, values.astype(np.float64) if whole else values)
         steps = len(self.actions)
         if steps == 0:
             raise ValueError("trajectory: expected at least one step, got none")

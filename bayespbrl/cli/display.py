@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import xarray as xr
 from rich.console import Console
@@ -187,9 +188,15 @@ def _table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     console.print(table)
 
 
+def _positive_optimum(environment: gymnasium.Env) -> float | None:
+    """The environment's optimal return, where a value is a share of it."""
+    optimum = environment_attribute(environment, "optimal_return")
+    return float(optimum) if optimum is not None and optimum > 0 else None
+
+
 def _print_iterations(learner: Learner) -> None:
     """A row for the first iteration, every fifth and the last, narrow enough for eighty columns."""
-    optimum = environment_attribute(learner.environment, "optimal_return")
+    optimum = _positive_optimum(learner.environment)
     # the number of answers does not identify an iteration where some ask nothing
     numbered = len({s["answers"] for s in learner.iterations}) < len(learner.iterations)
     rows = [
@@ -219,7 +226,7 @@ def show_trials(study: Trials) -> None:
     table, quartiles = study.table, study.quartiles()
     environment = open_environment(table.attrs["env"])
     title = f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials"
-    _print_quartiles(quartiles, environment_attribute(environment, "optimal_return"), title)
+    _print_quartiles(quartiles, _positive_optimum(environment), title)
     if table.attrs["redraws"]:
         seeds = table.attrs["redrawn_seeds"].replace(" ", ", ")
         console.print(f"Trials redrawn because they met no preference: {table.attrs['redraws']}, seeds {seeds}.")

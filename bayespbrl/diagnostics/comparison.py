@@ -60,7 +60,7 @@ def compare_likelihoods(
         for model in candidates.values()
     ]
     log_probability, converged = (np.array(values) for values in zip(*results, strict=True))
-    return _table(list(candidates), log_probability, converged, fold)
+    return _table(list(candidates), log_probability, converged, fold, answer_groups(groups, number))
 
 
 def plot_comparison(result: xr.Dataset, axes: Axes) -> Axes:
@@ -102,16 +102,18 @@ def _assigned_folds(groups: np.ndarray, folds: int, *, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).permutation(np.arange(len(labels)) % folds)[place]
 
 
-def _table(names: list[str], log_probability: np.ndarray, converged: np.ndarray, fold: np.ndarray) -> xr.Dataset:
+def _table(
+    names: list[str], log_probability: np.ndarray, converged: np.ndarray, fold: np.ndarray, groups: np.ndarray
+) -> xr.Dataset:
     elpd = log_probability.sum(axis=1)
     order = np.argsort(-elpd, kind="stable")
     with np.errstate(invalid="ignore"):  # both −∞: neither is better
         behind = log_probability - log_probability[order[0]]
     values = {
         "elpd": elpd,
-        "standard_error": _error_of_sum(log_probability),
+        "standard_error": _error_of_sum(log_probability, groups),
         "difference": np.sum(behind, axis=1),
-        "difference_error": _error_of_sum(behind),
+        "difference_error": _error_of_sum(behind, groups),
         "converged": converged,
     }
     columns = {name: ("candidate", value[order]) for name, value in values.items()}
@@ -120,10 +122,14 @@ def _table(names: list[str], log_probability: np.ndarray, converged: np.ndarray,
     return xr.Dataset({**columns, "log_probability": pointwise, "fold": ("preference", fold)}, coordinates)
 
 
-def _error_of_sum(values: np.ndarray) -> np.ndarray:
-    """Standard error of the sum along the last axis; NaN for fewer than two, or where one is infinite."""
-    number = values.shape[-1]
-    if number < 2:
-        return np.full(values.shape[0], np.nan)
+def _error_of_sum(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Standard error of the sum along the last axis, in which the rows of an answer are one summand.
+
+    NaN for fewer than two answers, or where a value is infinite.
+    """
     with np.errstate(invalid="ignore"):
-        return np.sqrt(number * np.var(values, axis=-1, ddof=1))  # Vehtari et al. (2017), eq. 24
+        sums = np.stack([values[..., groups == group].sum(axis=-1) for group in np.unique(groups)], axis=-1)
+        number = sums.shape[-1]
+        if number < 2:
+            return np.full(values.shape[0], np.nan)
+        return np.sqrt(number * np.var(sums, axis=-1, ddof=1))  # Vehtari et al. (2017), eq. 24

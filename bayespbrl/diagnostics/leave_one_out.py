@@ -11,47 +11,61 @@ from matplotlib.axes import Axes
 
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
-from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_probabilities, refit, tied_rows
+from bayespbrl.diagnostics.predictions import (
+    PREFERRED,
+    TIED,
+    answer_groups,
+    answer_probabilities,
+    refit,
+    tied_rows,
+)
 from bayespbrl.models.posterior_tree import answers_of, bases_of, settings_of
 
 PARETO_K_LIMIT = 0.7  # Vehtari et al. (2024)
 
 
-def influence(tree: xr.DataTree, *, refits: int | None = 3, **sampling_options: int) -> xr.Dataset:
-    """Change of the posterior when each of the K answers is left out.
+def influence(
+    tree: xr.DataTree, *, refits: int | None = 3, groups: np.ndarray | None = None, **sampling_options: int
+) -> xr.Dataset:
+    """Change of the posterior when each of the answers, of which the K rows follow, is left out.
 
     Args:
       tree: what `sample_posterior` returned.
+      groups: the number of the answer that each row follows from, never decreasing, shape (K,): rows of one answer are
+        left out together, and have the same figures. Every row is an answer of its own by default.
       refits: number of answers left out by an exact refit: those with the largest change by importance weights, a
         better predictor of the exact change than k̂. None for all.
       sampling_options: `num_samples` and the like of the refits; eq. 8 keeps the full K.
 
     Returns:
-      along `preference`: `pareto_k`; `change_estimated`, the root mean square change of the margins' means, by
-      importance weights; where `refitted`, and NaN elsewhere: `change`, the same by the refit,
-      `probability` of the answer given the others, and `margin_means` (preference, margin), the means of all margins
+      along `preference`, the rows: `pareto_k`; `change_estimated`, the root mean square change of the margins' means,
+      by importance weights; where `refitted`, and NaN elsewhere: `change`, the same by the refit, `probability` of the
+      row given the others, and `margin_means` (preference, margin), the means of all margins
       without the answer; `converged`, whether the refit converged. Also `margin_mean` (margin), given all answers.
     """
     number = tree["constant_data"].sizes["preference"]
     refits = None if refits is None else checks.whole("refits", refits, 0)
     differences, answers = np.asarray(tree["constant_data"]["differences"]), answers_of(tree)
     margin_mean = np.asarray(tree["posterior"]["margins"]).mean(axis=(0, 1))
-    pareto_k, estimated = _estimates(tree)
-    chosen = np.argsort(-estimated, kind="stable")[:refits]
+    groups = answer_groups(groups, number)
+    pareto_k, estimated = _estimates(tree, groups)
+    chosen = list(dict.fromkeys(groups[np.argsort(-estimated, kind="stable")]))[:refits]
     changes, probability = np.full(number, np.nan), np.full(number, np.nan)
     means, converged = np.full((number, number), np.nan), np.zeros(number, dtype=bool)
     outcome = np.where(tied_rows(tree), TIED, PREFERRED)
-    for k in chosen:
-        others = refit(tree, np.arange(number) != k, **sampling_options)
-        means[k] = _mean_margins(others, answers.with_sides(settings_of(differences), others.attrs["prior_scale"]))
-        changes[k] = _length(means[k] - margin_mean)
-        probability[k] = answer_probabilities(others, differences[..., [k], :], answers.of([k]))[0, outcome[k]]
-        converged[k] = bool(others.attrs["converged"])
+    for group in chosen:
+        rows = np.flatnonzero(groups == group)
+        others = refit(tree, groups != group, **sampling_options)
+        without = _mean_margins(others, answers.with_sides(settings_of(differences), others.attrs["prior_scale"]))
+        means[rows], changes[rows] = without, _length(without - margin_mean)
+        predicted = answer_probabilities(others, differences[..., rows, :], answers.of(rows))
+        probability[rows] = np.take_along_axis(predicted, outcome[rows][:, None], axis=1)[:, 0]
+        converged[rows] = bool(others.attrs["converged"])
     return xr.Dataset(
         {
             "pareto_k": ("preference", pareto_k),
             "change_estimated": ("preference", estimated),
-            "refitted": ("preference", np.isin(np.arange(number), chosen)),
+            "refitted": ("preference", np.isin(groups, chosen)),
             "change": ("preference", changes),
             "probability": ("preference", probability),
             "converged": ("preference", converged),
@@ -74,13 +88,14 @@ def plot_influence(result: xr.Dataset, axes: Axes) -> Axes:
     return finished(axes, xlabel="answer left out", ylabel="change of the mean margins")
 
 
-def _estimates(tree: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
+def _estimates(tree: xr.DataTree, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """k̂ and the root mean square change of the margins' means, each shape (K,)."""
     margins = np.asarray(tree["posterior"]["margins"])
     log_likelihood = np.asarray(tree["log_likelihood"]["answers"])
     draws = margins.reshape(margins.shape[0] * margins.shape[1], margins.shape[2])
     pareto_k, change = np.zeros(log_likelihood.shape[2]), np.zeros(log_likelihood.shape[2])
-    for k, column in enumerate(np.moveaxis(log_likelihood, 2, 0)):
+    for group in np.unique(groups):
+        k, column = groups == group, log_likelihood[:, :, groups == group].sum(axis=2)
         if np.ptp(column) == 0:  # a row of zeros: all weights are equal
             continue
         relative = min(1.0, float(array_stats.ess(column[..., None], chain_axis=0, draw_axis=1)[0]) / column.size)

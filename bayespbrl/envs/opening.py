@@ -211,12 +211,13 @@ def to_plain(
     """An observation of `space`, flattened, one-hot where it is discrete and `actions` are not.
 
     Raises:
-      ValueError: one whose parts are not those of the space.
+      ValueError: one that is not in a discrete space, or whose parts are not those of the space.
     """
-    if isinstance(space, Discrete) and isinstance(actions, Box):
-        return np.eye(int(space.n))[int(value - space.start)]
     if isinstance(space, Discrete):
-        return np.int64(value - space.start)
+        number = np.int64(value - space.start)
+        if not 0 <= number < space.n:
+            raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
+        return np.eye(int(space.n))[number] if isinstance(actions, Box) else number
     if isinstance(space, Box):
         return np.reshape(value, -1)
     try:

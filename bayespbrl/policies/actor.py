@@ -44,7 +44,7 @@ class Actor:
         expected = self.observation_shape
         if expected is not None and (shape := np.asarray(observation).shape) != expected:
             raise ValueError(f"observation: expected shape {expected}, got {shape}")
-        return self._drawn(self.policy, observation, key)
+        return self._drawn(self.policy, [observation], key)[0]
 
     __call__ = act
 
@@ -63,29 +63,31 @@ class Actor:
         """
         shape = self.observation_shape
         if shape is None or (observations := np.asarray(observation)).shape == shape:
-            return self._chosen(observation, deterministic), state
+            return self._chosen([observation], deterministic)[0], state
         if observations.shape[1:] != shape:
             raise ValueError(f"observation: expected shape {shape}, or a batch of them, got {observations.shape}")
-        return np.stack([np.asarray(self._chosen(each, deterministic)) for each in observations]), state
+        return np.array([np.asarray(action) for action in self._chosen(observations, deterministic)]), state
 
-    def _chosen(self, observation: Any, deterministic: bool) -> Any:
+    def _chosen(self, observations: Any, deterministic: bool) -> list[Any]:
+        """An action for each of several observations."""
         policy = greedy(self.policy) if deterministic else self.policy
         if not deterministic or isinstance(policy, Greedy):
-            return self._drawn(policy, observation)
+            return self._drawn(policy, observations)
         if not is_discrete(policy):
             raise ValueError(
                 f"deterministic: expected a policy with a method mode or probabilities, got {type(policy).__name__}"
             )
-        rows = np.asarray(self.observe(observation))[None]
-        return int(self.enact(int(np.argmax(policy.probabilities(rows)[0]))))
+        best = np.argmax(policy.probabilities(self._rows(observations)), axis=1)
+        return [int(self.enact(int(action))) for action in best]
 
-    def _drawn(self, policy: Sampler, observation: Any, key: Key[Array, ""] | None = None) -> Any:
+    def _rows(self, observations: Any) -> np.ndarray:
+        rows = np.array([self.observe(each) for each in observations])
+        return rows.astype(np.int64 if rows.ndim == 1 else np.float64)
+
+    def _drawn(self, policy: Sampler, observations: Any, key: Key[Array, ""] | None = None) -> list[Any]:
         if key is None:
             key = jax.random.key(int(self.rng.integers(2**31)))
-        observation = self.observe(observation)
-        dtype = np.int64 if np.ndim(observation) == 0 else np.float64
-        action = sample_actions(policy, key, np.asarray(observation, dtype=dtype)[None])[0]
-        if not isinstance(self.action_space, Box):
-            return int(self.enact(action))
-        clipped = np.clip(action, self.action_space.low, self.action_space.high)
-        return self.enact(clipped.astype(self.action_space.dtype))
+        actions, space = sample_actions(policy, key, self._rows(observations)), self.action_space
+        if not isinstance(space, Box):
+            return [int(self.enact(action)) for action in actions]
+        return [self.enact(np.clip(action, space.low, space.high).astype(space.dtype)) for action in actions]

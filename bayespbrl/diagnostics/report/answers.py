@@ -12,7 +12,9 @@ from bayespbrl.diagnostics.report.contents import RunContents
 from bayespbrl.diagnostics.report.document import Block, Body, Comparison, Picture, Table, drawn, thumbnail
 from bayespbrl.diagnostics.report.formatting import cell, number
 from bayespbrl.diagnostics.report.log import AnsweredQuestion
+from bayespbrl.diagnostics.report.tables import contradicted
 from bayespbrl.envs.pictures import draw_trajectory
+from bayespbrl.preferences import Answer
 
 # The most surprising answers have large pictures, the others small ones; beyond the cap an answer has numbers only.
 LARGE, PICTURED = 4, 60
@@ -26,7 +28,7 @@ def answers(contents: RunContents, table: xr.Dataset) -> Body:
     if np.isfinite(table["probability"].values).any() or np.isfinite(table["before"].values).any():
         caption = (
             "Probability of each answer. Open circles: before it was given. Dots: by the last posterior, which has "
-            "seen it. A dot below one half is an answer that contradicts the others."
+            "seen it. The lower a dot, the more the other answers speak against that one."
         )
         alt = f"Probabilities of {len(contents.answers)} answers before and after they were given."
         panels = [("", partial(figures.plot_answers, table))]
@@ -41,7 +43,7 @@ def answers(contents: RunContents, table: xr.Dataset) -> Body:
 
 
 def surprise_order(table: xr.Dataset) -> np.ndarray:
-    """Answers from the least to the most probable given all others, those without a probability last."""
+    """Answers from the least to the most probable given all, those without a probability last."""
     key = table["probability"].values
     key = np.where(np.isnan(key), table["before"].values, key)
     if np.isnan(key).all():
@@ -63,7 +65,8 @@ def _comparisons(
                 pictures[n] = thumbnail(f"trajectory-{n}", draw, f"trajectory {n}", f"Drawing of trajectory {n}.")
         title = f"Question {answer.question}: {_in_words(answer)}"
         both = tuple(pictures[n] for n in shown)
-        blocks.append(Comparison(title, _probabilities(table, int(k)), both, small=place >= LARGE))
+        known = _probabilities(table, int(k)) or _unused(contents, answer)
+        blocks.append(Comparison(title, known, both, small=place >= LARGE))
     return blocks
 
 
@@ -81,8 +84,16 @@ def _probabilities(table: xr.Dataset, k: int) -> str:
         parts.append(f"{before:.3f} beforehand")
     margin = float(table["margin"][k])
     if not parts and np.isfinite(margin):
-        parts.append(f"margin {number(margin)}" + (", contradicted by the estimate" if margin <= 0 else ""))
-    return ", ".join(parts) or "not used by the model"
+        parts.append(f"margin {number(margin)}" + (", contradicted by the estimate" if contradicted(table)[k] else ""))
+    return ", ".join(parts)
+
+
+def _unused(contents: RunContents, answer: AnsweredQuestion) -> str:
+    """What is said of an answer without a probability."""
+    options = contents.settings.estimation
+    if answer.answer is Answer.TIE and not contents.without_posterior and options.plain_draws is None:
+        return "the posterior learns from it that the two are alike"
+    return "not used by the model"
 
 
 def _rows(table: xr.Dataset, order: np.ndarray) -> Table:

@@ -6,6 +6,7 @@ A file that cannot be read costs only its own contents.
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ class RunContents:
         started = self.iterations[-1].get("restarted") if self.iterations else None
         return started if type(started) is int and 0 < started <= len(self.iterations) else 0
 
-    @property
+    @cached_property
     def compared(self) -> Mapping[int, Trajectory]:
         """The compared trajectories that can be read, or the compared part of each, by number."""
         if not self.clips:

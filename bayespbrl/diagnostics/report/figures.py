@@ -62,7 +62,7 @@ def plot_bound(table: xr.Dataset, axes: Axes) -> Axes:
     positive = values[np.isfinite(values) & (values > 0)]
     lowest = max(1e-6, positive.min() / 2) if positive.size else 1e-6
     _series(table.assign({name: np.maximum(table[name], lowest) for name in names}), axes, names)
-    return finished(axes, ylabel="KL to the policy before (nats)", yscale="log")
+    return finished(axes, ylabel="KL to the policy that was updated (nats)", yscale="log")
 
 
 def plot_temperature(table: xr.Dataset, axes: Axes) -> Axes:

@@ -50,7 +50,7 @@ class AnsweredQuestion:
 
     @property
     def before(self) -> float:
-        """The predicted probability of the answer that was given; NaN where the model does not use it."""
+        """The predicted probability of the answer that was given; NaN where it states no preference."""
         if self.row is None:
             return float("nan")
         return self.stated * (self.predicted if self.answer is Answer.FIRST else 1 - self.predicted)
@@ -129,9 +129,8 @@ def _applied(
             break
         if event["event"] == "answered":
             query = asked[event["query"]]
-            after = len(state.preferences.pairs)
-            row = after - 1 if after > pairs else None  # the pair that was asked about is the last of its answer's
-            answer = Answer(event["answer"])
+            answer, new = Answer(event["answer"]), state.preferences.pairs[pairs:]
+            row = next((pairs + k for k, pair in enumerate(new) if {*pair} == {query.first, query.second}), None)
             who = {name: event[name] for name in ("answerer", "seconds") if name in event}
             shown = (query.first, query.second)
             answers.append(AnsweredQuestion(query.number, state.iteration + 1, *shown, answer, row, **who))

@@ -147,16 +147,16 @@ def _predictive_checks(tree: xr.DataTree) -> Table:
     """Counts in the answers beside those in answers that the last posterior simulates."""
     result = predictive_checks(tree)
     caption = (
-        "Posterior predictive checks: the answers given, beside answers simulated by the last posterior. Surprises "
-        "contradict the inferred utility; cycles are triads that no utility can order. A p-value below 0.01 or above "
-        "0.99 says that the model does not explain this count."
+        "Posterior predictive checks: the preferences and ties that follow from the answers, beside those that the "
+        "last posterior simulates. Surprises contradict the inferred utility; cycles are triads that no utility can "
+        "order. A p-value below 0.01 or above 0.99 says that the model does not explain this count."
     )
     rows = []
     for name in result["check"].values[result["possible"].values > 0]:
         row = {key: float(value) for key, value in result.sel(check=name).data_vars.items()}
         interval = f"{number(row['expected'])} [{number(row['lower'])}, {number(row['upper'])}]"
         rows.append([str(name), number(row["observed"]), f"{int(row['possible'])}", interval, number(row["p_value"])])
-    return Table(caption, ["count", "in the answers", "of", "simulated [90 %]", "p"], rows)
+    return Table(caption, ["count", "given", "of", "simulated [90 %]", "p"], rows)
 
 
 def updates(iterations: xr.Dataset) -> Body:

@@ -39,7 +39,10 @@ def _value(contents: RunContents, iterations: xr.Dataset) -> str:
     text = f"After {so_far} the policy's value, the mean return of {episodes}, is {number(value[-1])}"
     optimum = contents.environment_attribute("optimal_return")
     if optimum is not None:
-        text += f", {percent(value[-1] / optimum, 1)} of the optimum {number(optimum)}"
+        share = f"{percent(value[-1] / optimum, 1)} of " if optimum > 0 else ""
+        text += f", {share}the optimum {number(optimum)}" if share else f"; the optimum is {number(optimum)}"
+    if not np.ptp(value) and not value[0]:
+        return f"{text}: the environment may give no reward."
     best = int(np.argmax(value))
     known = not np.isnan(answers[best])
     when = f"after {count(int(answers[best]), 'answer')}" if known else f"in iteration {best + 1}"
@@ -94,12 +97,14 @@ def _ranking(contents: RunContents, ranking: xr.Dataset) -> Iterator[str]:
     better = ranking["better_probability"].values[np.triu_indices(total, k=1)]
     certainty = float(np.mean(np.maximum(better, 1 - better)))
     yield (
-        f"Of two among {total} trajectories, the newest and the undominated one, the better one is known with "
+        f"Of two among {total} trajectories, the newest and the newest undominated one, the better one is known with "
         f"probability {percent(certainty)} on average (50 % is chance)."
     )
     for best in set(contents.preferences.undominated[-1:]) & set(ranking["trajectory"].values.tolist()):
         wins = percent(float(ranking["best_probability"].sel(trajectory=best)))
-        yield f"With probability {wins} the undominated trajectory, number {best}, is the best of these."
+        others = len(contents.preferences.undominated) - 1
+        of = f" ({count(others, 'other is', 'others are')} undominated too)" if others else ""
+        yield f"With probability {wins} the newest undominated trajectory, number {best}{of}, is the best of these."
 
 
 def _predictions(answers: xr.Dataset, scores: xr.Dataset) -> Iterator[str]:

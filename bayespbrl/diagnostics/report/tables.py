@@ -33,6 +33,7 @@ MEASURED = (
     *("entropy", "action_standard_deviation"),
     *("rhat_max", "effective_sample_size_min", "utility_converged", "log_evidence"),
 )
+ROUNDING = 1e-9  # of the largest margin
 DRAWS = 1000  # a standard deviation is then known to a fortieth of itself
 SHOWN_DRAWS, SHOWN_STATES, RESOLUTION = 3, 3000, 60
 Variables = dict[str, tuple[str | tuple[str, ...], np.ndarray]]
@@ -81,6 +82,12 @@ def answers_table(contents: RunContents) -> xr.Dataset:
     for name, column in zip(("probability", "margin", "margin_sd"), columns, strict=True):
         data[name] = ("answer", column)
     return xr.Dataset(data)
+
+
+def contradicted(answers: xr.Dataset) -> np.ndarray:
+    """Which answers of an `answers_table` the last estimate contradicts, shape (N,) bool; not those off by rounding."""
+    margins = answers["margin"].values
+    return np.asarray(margins < -ROUNDING * np.max(np.abs(margins), where=np.isfinite(margins), initial=0.0))
 
 
 def _by_last_estimate(

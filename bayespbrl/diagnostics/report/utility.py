@@ -43,8 +43,8 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
         blocks.append(_trajectories(compared))
     if ranking.sizes["trajectory"] > 1:
         caption = (
-            "Probability of each rank of the newest trajectories and the undominated one; rank 1 is the best. A sharp "
-            "diagonal: the order is well determined. A uniform column: the rank is unknown."
+            "Probability of each rank of the newest trajectories and the newest undominated one; rank 1 is the best. A "
+            "sharp diagonal: the order is well determined. A uniform column: the rank is unknown."
         )
         alt = f"Probabilities of the ranks of {ranking.sizes['trajectory']} trajectories."
         panels = [("Ranking", partial(plot_ranking, ranking))]
@@ -75,7 +75,9 @@ def _what_else(found: Mapping[str, Any], settings: int) -> str:
 def _remaining_uncertainty(table: xr.Dataset) -> list[str]:
     if "sd" not in table:
         return []
-    inside = table["reached"].values
+    inside = table["reached"].values & (table["prior_sd"].values > 0)
+    if not inside.any():
+        return []
     left = table["sd"].values[inside] / table["prior_sd"].values[inside]
     return [
         f"The posterior standard deviation is {percent(np.median(left))} of the prior's in the median over the states "
@@ -118,7 +120,7 @@ def _maps(table: xr.Dataset) -> list[Picture]:
             shown.append(used)
             caption += " The learner acted on the fourth map."
     if np.isnan(blank).any():
-        caption += " Grey: so far from every centre of the features that the utility is nearly zero."
+        caption += " Grey: where the features, and with them the utility, are nearly zero."
     panels = [
         (title, partial(figures.plot_states, table, table[name].values + blank, label=label, cmap=colours))
         for name, title, label, colours in shown

@@ -11,12 +11,14 @@ from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.formatting import count, number
 from bayespbrl.diagnostics.report.people import has_people, people_warnings
 from bayespbrl.diagnostics.report.summary import ENOUGH_PREDICTIONS
+from bayespbrl.diagnostics.report.tables import contradicted
 from bayespbrl.preferences import Answer
 
 # Entropy has collapsed below a tenth of that of a uniform choice, or of the first policy. A continuous policy has lost
 # three nats a dimension when its standard deviation is a twentieth of the first.
 ENTROPY_LEFT, ENTROPY_LOST = 0.1, 3.0
 SURPRISING = 0.1
+FIT_NOISE = 0.03  # nats by which a refit moves a policy, however small the bound
 # The confidence of the default schedule sets its own bounds.
 SMALLER = "smaller updates (--schedule constant with a small --kl-bound)"
 
@@ -63,8 +65,8 @@ def _of_updates(table: xr.Dataset) -> Iterator[ReportWarning]:
     iteration, failed = table["iteration"].values, table["reps_converged"].values == 0
     if failed.any():
         yield ReportWarning(
-            f"REPS did not converge in {_which(iteration[failed])}: that update changed nothing.",
-            f"Fewer centres (--centres) or {SMALLER} make the dual easier to solve.",
+            f"REPS did not converge in {_which(iteration[failed])}: the last update there changed nothing.",
+            f"Fewer centres (--centres), where states are continuous, or {SMALLER} make the dual easier to solve.",
         )
     if (idle := iteration[(table["bound_active"].values == 0) & ~failed]).size:
         yield ReportWarning(
@@ -87,12 +89,13 @@ def _of_fitted_policy(table: xr.Dataset) -> Iterator[ReportWarning]:
     # of several updates the policy's KL is that of all together, and REPS' own that of the last alone
     several = table["updates"].values > 1
     fitted, reached = table["kl_fitted_policy"].values, np.where(several, table["kl_bound"], table["kl"])
-    if (far := iteration[fitted > 3 * np.maximum(reached, 0.01)]).size:
+    if (far := iteration[fitted > 3 * np.maximum(reached, FIT_NOISE)]).size:
         yield ReportWarning(
             f"The fitted policy moved more than three times as far as REPS asked for in {_which(far)}.",
-            f"The bound does not hold there. Try another kind of policy (--policy) or {SMALLER}.",
+            "The bound does not hold there. Try another kind of policy (--policy), or more trajectories an iteration.",
         )
-    if (near := iteration[(fitted < reached / 3) & (reached > 0.02)]).size > 0.2 * len(iteration):
+    active = table["bound_active"].values != 0  # else REPS itself did not go as far as the bound
+    if (near := iteration[active & (fitted < reached / 3) & (reached > 0.02)]).size > 0.2 * len(iteration):
         yield ReportWarning(
             f"The fitted policy moved less than a third as far as REPS asked for in {_which(near)}.",
             "The policy smooths the update. Harmless while the value rises. A larger bound moves it further"
@@ -129,11 +132,13 @@ def _of_value(table: xr.Dataset) -> Iterator[ReportWarning]:
 
 def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWarning]:
     question = answers["question"].values
-    if (against := question[answers["margin"].values < 0]).size:
+    if (against := question[contradicted(answers)]).size:
+        allowed = "" if contents.without_posterior else ", the lapse rate allows for them, unless it is set"
         yield ReportWarning(
             f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
-            "See the pictures below. If these answers are mistakes, the lapse rate allows for them, unless it is set. "
-            "If they are right, the features cannot express what matters: use more centres or features of your own.",
+            f"See the pictures below. If these answers are mistakes{allowed or ', nothing is wrong'}. If they are "
+            "right, the features cannot express what matters: use features of your own, or more centres where states "
+            "are continuous.",
         )
     if (surprising := question[answers["before"].values < SURPRISING]).size:
         yield ReportWarning(
@@ -145,8 +150,9 @@ def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWa
     ties = sum(answer.answer is Answer.TIE for answer in contents.answers)
     if ties > 0.3 * max(3, len(contents.answers)):
         yield ReportWarning(
-            f"{ties} of {len(contents.answers)} answers were ties, from which the posterior learns little.",
-            "Longer trajectories, or less similar ones, are easier to tell apart.",
+            f"{ties} of {len(contents.answers)} answers were ties: they say that two are alike, not what is better.",
+            "Harmless where the trajectories are good. Otherwise longer ones, or less similar ones, are easier to tell "
+            "apart.",
         )
 
 

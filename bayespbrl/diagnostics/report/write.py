@@ -1,5 +1,6 @@
 """The diagnostic report of a run: read the run, assemble the report, write it as one file."""
 
+import shlex
 from collections.abc import Callable
 from datetime import datetime
 from importlib.metadata import version
@@ -126,7 +127,14 @@ def _state(contents: RunContents) -> str:
     text = f"In progress: {done} of at most {wanted} iterations.{question} "
     if contents.settings.own_parts:
         return text + f"Continue it in Python with bayespbrl.resume({str(contents.path)!r}) and your own objects."
-    return text + f"Continue it with: bayespbrl resume {contents.path}"
+    return text + f"Continue it with: {_continuing(contents)}"
+
+
+def _continuing(contents: RunContents) -> str:
+    """The command that goes on, for the people who have answered so far."""
+    command = ["bayespbrl", "ask" if contents.settings.expert == "page" else "resume", str(contents.path)]
+    command += [f"--answerer={name}" for name in contents.preferences.answerers if name is not None]
+    return shlex.join([*command, *["--import-package"] * (":" in contents.settings.env)])
 
 
 def _facts(contents: RunContents) -> list[tuple[str, str]]:
