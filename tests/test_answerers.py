@@ -28,8 +28,8 @@ from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.events import Entry, LearnerState, apply
 from bayespbrl.models import Answers, PreferenceModel, posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import utility_margins
-from bayespbrl.preferences import PastQuestion, Source
-from bayespbrl.questions import LEAST_BETWEEN
+from bayespbrl.preferences import Answer, PastQuestion, Source
+from bayespbrl.questions import LEAST_BETWEEN, Questions, repeated
 from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.utility.comparisons import Comparisons
 
@@ -239,6 +239,18 @@ def test_repeated_questions_stay_within_the_budget_and_are_of_the_one_who_answer
     past = {question.number: question for question in run.state.past}
     later = [query for query in asked[1:] if query.repeats is not None]
     assert all(past[query.repeats].answerer == "Bob" for query in later)
+
+
+def test_of_several_people_nobody_is_asked_again_what_they_were_asked_just_now():
+    names = ["Ada", "Ada", *3 * ["Ben"], "Ada", *3 * ["Ben"]]
+    past = [PastQuestion(n, 0, n, n, None, Answer.FIRST, answerer=who) for n, who in enumerate(names, start=1)]
+    options, rng = Questions(repeats=0.5), np.random.default_rng(0)
+
+    def of(person):
+        return {repeated(past, 10, options, left=10, rng=rng, answerer=person) for _ in range(50)}
+
+    assert of("Ada") == {None}  # 1, 2 and 6 are her last three, though others came between
+    assert {one.number for one in of("Ben")} == {3, 4, 5}
 
 
 def test_people_are_asked_a_tenth_again_and_wait_for_no_silent_iteration():

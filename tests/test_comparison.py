@@ -5,6 +5,7 @@ from matplotlib.figure import Figure
 from scipy.special import expit
 
 from bayespbrl.diagnostics import compare_likelihoods, plot_comparison, predictions
+from bayespbrl.diagnostics import comparison as comparison_module
 from bayespbrl.models import PreferenceModel, posterior_draws
 
 SAMPLING = {"num_warmup": 50, "num_samples": 250, "max_samples": 250}
@@ -89,6 +90,13 @@ def test_rows_of_one_answer_are_left_out_together():
     fold = compare_likelihoods(ROWS, candidates, folds=2, groups=groups, **FEW)["fold"].values
     assert all(len(set(fold[groups == group])) == 1 for group in groups)
     assert set(fold) == {0, 1}
+
+
+def test_rows_of_one_answer_are_one_summand_of_the_standard_error():
+    one = np.array([[0.1, -2.0, 0.7]])
+    alone = comparison_module._error_of_sum(one, np.arange(3))
+    together = comparison_module._error_of_sum(np.repeat(one, 2, axis=1) / 2, np.repeat(np.arange(3), 2))
+    np.testing.assert_allclose(together, alone)
 
 
 @pytest.mark.parametrize("number", [0, 1])

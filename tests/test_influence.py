@@ -37,6 +37,18 @@ def test_the_answer_that_contradicts_the_others_is_the_most_influential_and_the_
     assert np.all(np.delete(means.values, 4) > 0)
 
 
+def test_rows_of_one_answer_are_left_out_together():
+    tree = sample_posterior(CONTRADICTED, likelihood="logistic", **FEW)
+    groups = np.array([0, 1, 1, 1, 2, 3, 4])
+    result = influence(tree, refits=2, groups=groups, **FEW)
+    for name in ("pareto_k", "change_estimated", "change", "refitted"):
+        assert all(len(set(map(str, result[name].values[groups == group]))) == 1 for group in groups)
+    assert len(set(groups[result["refitted"].values])) == 2
+    alone = influence(tree, refits=0, **FEW)["change_estimated"].values
+    np.testing.assert_array_equal(result["change_estimated"].values[[0, 4]], alone[[0, 4]])
+    assert result["change_estimated"].values[1] > alone[1:4].max()
+
+
 @pytest.mark.slow
 def test_without_an_answer_the_means_are_those_by_quadrature():
     rows = np.array([[0.7], [-0.4], [0.9]])

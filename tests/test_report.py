@@ -24,7 +24,9 @@ from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report import document as report_document
 from bayespbrl.diagnostics.report import figures as report_figures
 from bayespbrl.diagnostics.report import sections as report_sections
+from bayespbrl.diagnostics.report import summary as report_summary
 from bayespbrl.diagnostics.report import tables as report_tables
+from bayespbrl.diagnostics.report import write as report_write
 from bayespbrl.diagnostics.report.answers import surprise_order
 from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.diagnostics.report.formatting import number
@@ -457,6 +459,9 @@ def test_of_several_updates_the_policys_kl_is_compared_with_the_bound_and_not_th
         (warning,) = of_the_fitted_policy(kl_fitted_policy=fitted)
         assert words in warning.what
         assert "--updates-per-iteration" not in warning.remedy
+    # a refit moves a policy a little whatever the bound; where the bound is inactive REPS did not go as far
+    assert not of_the_fitted_policy(kl_bound=0.004, kl_fitted_policy=0.06)
+    assert not of_the_fitted_policy(kl_fitted_policy=0.0001, bound_active=False)
     (warning,) = of_the_fitted_policy(updates=1, kl=0.3, kl_fitted_policy=0.05)
     assert "--updates-per-iteration 3" in warning.remedy
     _, (picture, *_) = report_sections.updates(
@@ -491,6 +496,57 @@ def test_an_answer_that_the_estimate_contradicts_is_named(tmp_path):
     assert (table["margin"].values > 0).all()
     reversed_answers = tuple(replace(answer, answer="second") for answer in contents.answers)
     assert any("contradicts 2 answers: 1–2" in text for text in warned(replace(contents, answers=reversed_answers)))
+    (warning,) = [
+        each for each in warnings_of(replace(contents, answers=reversed_answers)) if "contradicts" in each.what
+    ]
+    assert "lapse rate" not in warning.remedy  # a linear program has none
+    rounded = table.assign(margin=("answer", np.array([1.0, -2e-16])))
+    assert report_tables.contradicted(rounded).tolist() == [False, False]
+
+
+@pytest.mark.slow
+def test_a_tie_is_said_to_be_used_and_the_asked_pair_is_found_among_those_of_its_answer(tmp_path):
+    said = iter(["first", "tie", "second"])
+    directory = tmp_path / "run"
+    start(directory, iterations=2).run(lambda first, second: next(said))
+    contents = read_contents(directory)
+    text = read(write_report(directory)).text
+    assert "the posterior learns from it that the two are alike" in text
+    assert "not used by the model" not in text
+    assert any("ties: they say that two are alike" in each for each in warned(contents))
+    for answer in contents.answers:
+        if answer.row is not None:
+            assert {*contents.preferences.pairs[answer.row]} == {answer.first, answer.second}
+
+
+@pytest.mark.parametrize(
+    ("optimum", "words"), [(200.0, "of the optimum 200"), (0.0, "; the optimum is 0"), (-10.0, "; the optimum is -10")]
+)
+def test_the_value_is_a_share_of_a_positive_optimum_alone(contents, optimum, words):
+    class Known:
+        def environment_attribute(self, name):
+            return optimum
+
+        def __getattr__(self, name):
+            return getattr(contents, name)
+
+    text = report_summary._value(Known(), report_tables.iterations_table(contents.iterations))
+    assert words in text
+    assert ("%" in text) == (optimum > 0)
+
+
+def test_a_run_without_reward_is_not_said_to_be_without_progress(contents):
+    rows = [summary | {"value": 0.0} for summary in contents.iterations]
+    text = report_summary._value(contents, report_tables.iterations_table(rows))
+    assert text.endswith("the environment may give no reward.")
+
+
+def test_a_run_in_progress_is_continued_by_those_who_answered(tmp_path):
+    learner = start(tmp_path / "a run", expert="page")
+    learner.ask()
+    learner.tell(["first"], answerer="Ada")
+    text = report_write._state(read_contents(tmp_path / "a run"))
+    assert text.endswith(f"Continue it with: bayespbrl ask '{tmp_path / 'a run'}' --answerer=Ada")
 
 
 @pytest.mark.slow

@@ -83,6 +83,18 @@ def test_what_is_not_finite_is_refused_by_name(name, bad):
         Trajectory(**parts)
 
 
+def test_a_trajectory_equals_itself_alone():
+    one, other = (Trajectory(np.zeros((2, 1)), np.zeros(1, int), np.zeros(1)) for _ in range(2))
+    assert one in [other, one]
+    assert one != other
+    assert len({one, other}) == 2
+
+
+def test_whole_numbers_are_float64_but_where_states_or_actions_are_discrete():
+    both = Trajectory([[0, 1], [1, 2]], [[3]], [1]), Trajectory([0, 1], [1], [True])
+    assert [part.dtype.kind for one in both for part in (one.states, one.actions, one.rewards)] == [*"fff", *"iif"]
+
+
 def test_lists_become_arrays():
     given = Trajectory([[0.0], [1.0]], [[0.5]], [2.0])
     for array, expected in ((given.states, [[0.0], [1.0]]), (given.actions, [[0.5]]), (given.rewards, [2.0])):

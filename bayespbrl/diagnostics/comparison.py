@@ -127,9 +127,9 @@ def _error_of_sum(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
 
     NaN for fewer than two answers, or where a value is infinite.
     """
+    labels = np.unique(groups)
+    if (number := len(labels)) < 2:
+        return np.full(values.shape[0], np.nan)
     with np.errstate(invalid="ignore"):
-        sums = np.stack([values[..., groups == group].sum(axis=-1) for group in np.unique(groups)], axis=-1)
-        number = sums.shape[-1]
-        if number < 2:
-            return np.full(values.shape[0], np.nan)
+        sums = np.stack([values[..., groups == label].sum(axis=-1) for label in labels], axis=-1)
         return np.sqrt(number * np.var(sums, axis=-1, ddof=1))  # Vehtari et al. (2017), eq. 24
