@@ -28,7 +28,7 @@ from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.events import Entry, LearnerState, apply
 from bayespbrl.models import Answers, PreferenceModel, posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import utility_margins
-from bayespbrl.preferences import Answer, PastQuestion, Source
+from bayespbrl.preferences import PastQuestion, Source
 from bayespbrl.questions import LEAST_BETWEEN, Questions, repeated
 from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.utility.comparisons import Comparisons
@@ -243,7 +243,7 @@ def test_repeated_questions_stay_within_the_budget_and_are_of_the_one_who_answer
 
 def test_of_several_people_nobody_is_asked_again_what_they_were_asked_just_now():
     names = ["Ada", "Ada", *3 * ["Ben"], "Ada", *3 * ["Ben"]]
-    past = [PastQuestion(n, 0, n, n, None, Answer.FIRST, answerer=who) for n, who in enumerate(names, start=1)]
+    past = [PastQuestion(n, 0, n, n, None, Answer.FIRST, who, None) for n, who in enumerate(names, start=1)]
     options, rng = Questions(repeats=0.5), np.random.default_rng(0)
 
     def of(person):

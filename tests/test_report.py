@@ -520,7 +520,7 @@ def test_a_tie_is_said_to_be_used_and_the_asked_pair_is_found_among_those_of_its
 
 
 @pytest.mark.parametrize(
-    ("optimum", "words"), [(200.0, "of the optimum 200"), (0.0, "; the optimum is 0"), (-10.0, "; the optimum is -10")]
+    ("optimum", "words"), [(200.0, "of the optimum 200"), (0.0, "; the optimum is 0"), (-10.0, "; the optimum is −10")]
 )
 def test_the_value_is_a_share_of_a_positive_optimum_alone(contents, optimum, words):
     class Known:
