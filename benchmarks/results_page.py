@@ -128,6 +128,7 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
     """
     row = cheapest(data)
     if row is None or data.description.get("version") != version("bayespbrl"):
+        print(f"study {data.name}: of version {data.description.get('version')}, not run again.")
         return []
     seed, entries = row.seeds[0], again(row, processes)
     kept = row.lines[row.lines["seed"] == seed]
@@ -146,6 +147,8 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
         return []
     if not found and len(entries) != len(kept):
         found = [(0, f"{where}: expected {len(kept)} iterations, got {len(entries)}")]
+    if not found:
+        print(f"{where}: as kept.")
     return [text for _, text in found]
 
 
