@@ -141,6 +141,8 @@ QUERY_RULES: dict[str, QueryRule] = {
     "eubo": eubo,
     "information-when-unsure": InformationWhenUnsure(),
 }
+WITHOUT_DRAWS = ("highest-utility",)  # the rules that a point estimate can follow
+BY_SIGNAL = ("information-when-unsure",)  # those that need a schedule with a signal
 
 
 def candidates(rule: QueryRule, situation: QuerySituation) -> tuple[int, ...]:

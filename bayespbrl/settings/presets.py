@@ -10,6 +10,7 @@ from typing import Any
 from bayespbrl import checks
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.experts import SIMULATED
+from bayespbrl.queries import WITHOUT_DRAWS
 from bayespbrl.settings.tasks import Task
 from bayespbrl.utility.inference import WITHOUT_POSTERIOR
 
@@ -142,5 +143,5 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     if people:
         options |= PEOPLE
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":
-        options["query"] = "highest-utility"
+        options["query"] = WITHOUT_DRAWS[0]
     return options

@@ -16,6 +16,7 @@ from bayespbrl.improvement.q_function import Critic
 from bayespbrl.improvement.schedules import SCHEDULES
 from bayespbrl.models import PreferenceModel
 from bayespbrl.policies.choice import POLICIES
+from bayespbrl.queries import BY_SIGNAL, WITHOUT_DRAWS
 from bayespbrl.questions import Questions
 from bayespbrl.settings import presets
 from bayespbrl.settings.presets import preset_options
@@ -158,12 +159,13 @@ class Settings:
         """Check options that depend on options of another part."""
         utility, query, schedule = self.estimation.utility, self.questions.query, self.update.schedule
         checks.one_of("schedule", schedule, (*SCHEDULES, "other"))
-        if utility in WITHOUT_POSTERIOR and query not in ("highest-utility", "other"):
-            raise ValueError(f"query: expected highest-utility with {utility}, which has no posterior, got {query!r}")
+        if utility in WITHOUT_POSTERIOR and query not in (*WITHOUT_DRAWS, "other"):
+            rules = " or ".join(WITHOUT_DRAWS)
+            raise ValueError(f"query: expected {rules} with {utility}, which has no posterior, got {query!r}")
         if self.estimation.plain_draws is not None and None in (self.model.steepness, self.model.lapse_rate):
             given = f"{self.model.steepness} and {self.model.lapse_rate}"
             raise ValueError(f"plain_draws: expected numbers as steepness and lapse_rate, got {given}")
-        if query == "information-when-unsure" and schedule != "confidence":
+        if query in BY_SIGNAL and schedule != "confidence":
             raise ValueError(f"schedule: expected confidence with the query rule {query}, got {schedule!r}")
         if self.wrong_answers and self.expert not in SIMULATED:
             raise ValueError(f"wrong_answers: expected 0 with the expert {self.expert}, got {self.wrong_answers}")
