@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayespbrl import events, queries, questions, rollouts
+from bayespbrl.envs.stepping import step_limit
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
@@ -58,7 +59,7 @@ class Cycle:
 
     def __post_init__(self) -> None:
         steps, options = self.settings.questions.clip_steps, self.settings.rollouts
-        if steps is not None and steps > (limit := rollouts.step_limit(self.environment, options.max_steps)):
+        if steps is not None and steps > (limit := step_limit(self.environment, options.max_steps)):
             raise ValueError(f"clip_steps: expected at most {limit}, the steps of an episode, got {steps}")
 
     @one_blas_thread()
@@ -142,9 +143,8 @@ class Cycle:
         options = self.settings.rollouts
         if options.exploration_hold is not None:
             return options.exploration_hold
-        first = state.trajectories[: options.trajectories_per_iteration]
-        limit = rollouts.step_limit(self.environment, options.max_steps)
-        length = np.mean([len(each) for each in first]) if first else limit
+        first = [len(each) for each in state.trajectories[: options.trajectories_per_iteration]]
+        length = np.mean(first or [step_limit(self.environment, options.max_steps)])
         return max(1, round(float(length) / HOLDS))
 
     def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> questions.Chosen:

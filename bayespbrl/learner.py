@@ -78,7 +78,7 @@ class Learner:
         own = {
             "policy": policy if own_policy is None else "other",
             "features": None if features is None else "other",
-            "environment": None if opening.given_by_name(env) else "other",
+            "environment": None if (how := opening.reopened(env)) == "named" else how,
             "schedule": "other" if callable(schedule) else schedule,
             "query": "other" if callable(query) else query,
         }
@@ -204,7 +204,8 @@ class Learner:
 
         Raises:
           ValueError: an answer that is none, not as many answers as questions, or a bad name or time; nothing has
-            happened then.
+            happened then. Or what follows the answer fails, as the environment may: the answer is kept, and `ask` tries
+            again.
         """
         self._take_in(self._waiting(), answers, answerer, seconds)
         self._advance()

@@ -64,6 +64,8 @@ class Questions:
         checks.optional(checks.whole, "clip_steps", self.clip_steps)
         for name in ("same_start", "worthwhile", "shared_repeats"):
             checks.boolean(name, getattr(self, name))
+        if self.shared_repeats and not self.repeats:
+            raise ValueError("shared_repeats: expected false without repeats, got true")
         if self.same_start and self.clip_steps is not None:
             raise ValueError("same_start: expected false with clip_steps, because clips begin at any step, got true")
 
@@ -127,9 +129,9 @@ def later_questions(rule: QueryRule, situation: QuerySituation, options: Questio
     order, opponents, information = candidates(rule, situation), None, None
     if options.same_start:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)
-    if options.worthwhile and situation.estimate.posterior is not None:
+    if situation.estimate.posterior is not None:
         information = float(replace(situation, new=order[:1]).information()[0])
-    worth = information is None or information >= LEAST_INFORMATION
+    worth = not options.worthwhile or information is None or information >= LEAST_INFORMATION
     wanted = options.within_budget(options.queries_per_iteration, answers) if worth else 0
     return Chosen(wanted, order, opponents, information)
 

@@ -25,8 +25,8 @@ from jaxtyping import Bool, Float, Int, Key, Shaped
 from bayespbrl.checks import whole
 from bayespbrl.envs import functional
 from bayespbrl.envs.functional import FunctionalEnv
-from bayespbrl.envs.opening import AnyEnvironment, environment_attribute, environment_name, layers, open_environment
-from bayespbrl.envs.stepping import episodes_by_interface, outside_of
+from bayespbrl.envs.opening import AnyEnvironment, environment_name, layers, open_environment
+from bayespbrl.envs.stepping import episodes_by_interface, outside_of, step_limit
 from bayespbrl.policies.policy import AnyArray, Sampler
 from bayespbrl.trajectories import Trajectory
 
@@ -134,21 +134,6 @@ def reset_seed(key: Key[Array, ""]) -> int:
     The other episodes' count up from it, but for environments with a vector version of their own.
     """
     return int(jax.random.randint(jax.random.split(key)[0], (), 0, 2**30))
-
-
-def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int:
-    """The time limit that holds: `max_steps`, else the `TimeLimit` wrapper's, else the spec's, else the dynamics'."""
-    env = open_environment(environment)
-    if max_steps is not None:
-        return whole("max_steps", max_steps)
-    wrapped = [layer._max_episode_steps for layer in layers(env) if isinstance(layer, TimeLimit)]
-    limits: list[int | None] = [min(wrapped, default=None)]
-    limits.append(env.spec.max_episode_steps if env.spec is not None else None)
-    limits.append(environment_attribute(env, "max_episode_steps"))
-    for limit in limits:
-        if limit is not None:
-            return int(limit)
-    raise ValueError(f"max_steps: expected a number, because {environment_name(env)} has no time limit, got None")
 
 
 def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episodes: int, max_steps: int | None) -> int:

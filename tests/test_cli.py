@@ -86,12 +86,18 @@ def test_trials_tell_redraws_and_how_long_the_final_policies_last(capsys, tmp_pa
         {"seed": [1, 3], "iteration": [1]},
         {"env": "bicycle", "utility": "posterior-mean", "redraws": 2, "redrawn_seeds": "2 4"},
     )
-    table["terminated"] = ("seed", "iteration"), np.array([[0.0], [0.25]])
+    table = xr.concat([table, table.assign_coords(iteration=[2])], "iteration")
+    table["terminated"] = ("seed", "iteration"), np.array([[0.5, 0.0], [0.25, 0.25]])
+    # the second trial ended after its first iteration; what stands in its second place is no fit of its
+    table["seconds_utility"] = ("seed", "iteration"), np.array([[1.0, 1.0], [1.0, np.nan]])
+    table["utility_converged"] = ("seed", "iteration"), np.array([[1.0, 1.0], [0.0, 0.0]])
     table["balancing_steps"] = "seed", np.array([100.0, 300.0]), {"max_steps": 3000, "episodes": 100}
     show_trials(Trials(table, tmp_path))
     shown = capsys.readouterr().out
     assert "Trials redrawn because they met no preference: 2, seeds 2, 4." in shown
     assert "87.5% of the evaluation episodes survive (worst trial 75.0%)" in shown
+    assert "KL bound active in 3 of 3 iterations" in shown
+    assert "fits that did not converge: 1." in shown
     assert "200 steps in the median trial, 100 in the worst, at most 3000" in shown
     assert (tmp_path / "trials.png").read_bytes().startswith(b"\x89PNG")
 

@@ -278,6 +278,15 @@ def test_an_environment_that_no_seed_resets_is_compared_across_starts():
     assert Learner(Unseeded(), answers=3, **FAST).comparable_starts is None  # not asked for
 
 
+def test_what_the_best_question_is_worth_is_told_where_people_answer():
+    learner = Learner("gridworld", expert="other", answers=4, **FAST)
+    assert learner.worth_asking is None
+    while learner.state.iteration < 1:
+        learner.tell(["first"] * len(learner.ask()))
+    assert 0 <= learner.worth_asking <= 1
+    assert not learner.settings.questions.worthwhile  # nothing is left out by it
+
+
 @pytest.mark.slow
 def test_a_stopped_run_of_the_default_goes_on_bit_for_bit(tmp_path):
     options = {"answers": 3, "same_start": True, "iterations": 4, **FAST, "hyperparameters": "inferred"}

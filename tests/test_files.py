@@ -1,6 +1,7 @@
 """Files are whole or not there, whatever goes wrong while they are written."""
 
 import os
+import stat
 import subprocess
 import sys
 from unittest import mock
@@ -67,9 +68,11 @@ def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
 
 def test_the_content_is_on_the_disk_before_it_takes_the_files_place(tmp_path, monkeypatch):
     file, synced = tmp_path / "file", []
-    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append((os.fstat(descriptor).st_size, file.exists())))
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append((os.fstat(descriptor), file.exists())))
     write_file(file, "content")
-    assert synced == [(7, False)]
+    (content, before), (folder, after) = synced
+    assert (content.st_size, before) == (7, False)
+    assert (stat.S_ISDIR(folder.st_mode), after) == (True, True)  # the name is flushed too
 
 
 def test_a_netcdf_file_has_all_groups_and_no_room_to_spare(tmp_path):

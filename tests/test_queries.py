@@ -25,6 +25,8 @@ from bayespbrl.trajectories import Trajectory
 class Draws:
     """An estimate whose trajectories are the numbers of columns of a table of draws."""
 
+    posterior = None  # no tree of draws
+
     def __init__(self, table, likelihood):
         self.table, self.answers = table, likelihood
 

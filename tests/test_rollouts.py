@@ -18,7 +18,7 @@ from bayespbrl import rollouts
 from bayespbrl.envs import functional, opening
 from bayespbrl.envs.gridworld import Gridworld
 from bayespbrl.envs.opening import open_environment
-from bayespbrl.envs.stepping import random_episodes
+from bayespbrl.envs.stepping import random_episodes, step_limit
 from bayespbrl.features import checked_features
 from bayespbrl.rollouts import returns, rollout
 from bayespbrl.settings import Task
@@ -538,7 +538,7 @@ def test_bad_arguments_are_named(run, options, message):
     ("environment", "limit"), [("bicycle", 50), ("CartPole-v1", 500), (gymnasium.wrappers.TimeLimit(Plain(), 4), 4)]
 )
 def test_the_time_limit_is_the_environments_own(environment, limit):
-    assert rollouts.step_limit(environment) == limit
+    assert step_limit(environment) == limit
 
 
 def test_episodes_of_random_actions_are_cut_and_held_the_same_at_every_call():

@@ -1,5 +1,6 @@
 """A run on disk: what it holds, that it comes back bit for bit, and what happens to damaged ones."""
 
+import dataclasses
 import errno
 import json
 import multiprocessing
@@ -22,10 +23,12 @@ import bayespbrl
 from bayespbrl import Learner, ReturnExpert
 from bayespbrl.diagnostics.report import write_report
 from bayespbrl.envs.opening import given_by_name, open_environment
-from bayespbrl.policies import TabularPolicy
+from bayespbrl.envs.stepping import step_limit
+from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.runs import directory as run_directory
 from bayespbrl.runs import run as runs
 from bayespbrl.runs.directory import PartialLine, RunDirectory, read_log_lines
+from bayespbrl.runs.stored_classes import classes_of, from_tree, to_tree
 from bayespbrl.settings.presets import PAPER
 
 FILES = {"settings.json", "events.jsonl", "summary.json", "iterations"}
@@ -728,6 +731,85 @@ def test_arguments_that_are_arrays_are_compared():
         assert not given_by_name(gymnasium.make("Goal-v0", goal=np.ones(3)))
     finally:
         del gymnasium.registry["Goal-v0"]
+
+
+def test_a_run_of_an_object_of_a_registered_environment_goes_on_bit_for_bit(tmp_path):
+    options = QUICK | {"utility": "linear-program", "max_steps": 12, "iterations": 3}
+    whole = bayespbrl.Learner(gymnasium.make("Pendulum-v1"), **options).run(ReturnExpert())
+    learner = bayespbrl.start(gymnasium.make("Pendulum-v1"), tmp_path / "run", **options)
+    learner.tell([ReturnExpert()(*query.trajectories) for query in learner.ask()])
+    assert learner.settings.environment == "object"
+    resumed = runs.resume(tmp_path / "run").run(ReturnExpert())
+    assert fingerprint(resumed) == fingerprint(whole)
+
+
+def test_an_object_keeps_its_own_time_limit():
+    assert step_limit(gymnasium.make("Pendulum-v1"), 500) == 200
+    assert step_limit("Pendulum-v1", 500) == 500
+    assert step_limit(gymnasium.make("Pendulum-v1"), 50) == 50
+
+
+def test_options_of_numpy_are_kept_as_numbers(tmp_path):
+    options = QUICK | {"seed": np.int64(3), "kl_bound": np.float32(0.5), "answers": np.int64(4)}
+    learner = bayespbrl.start("gridworld", tmp_path / "run", **options)
+    assert learner.settings == bayespbrl.load(tmp_path / "run").settings
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Net:
+    weights: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Nested(LinearGaussianPolicy):
+    net: Net = dataclasses.field(default_factory=lambda: Net(np.zeros(2)))
+
+
+def test_a_policy_of_parts_is_known_by_all_their_classes():
+    first = bayespbrl.Learner("Pendulum-v1", policy="linear-gaussian", **QUICK).first_policy()
+    fields = {field.name: getattr(first, field.name) for field in dataclasses.fields(LinearGaussianPolicy)}
+    policy = Nested(**fields)
+    assert classes_of(policy) == (Nested, Net)
+    back = from_tree(to_tree(policy), known=classes_of(policy))
+    np.testing.assert_array_equal(back.net.weights, policy.net.weights)
+    with pytest.raises(ValueError, match="expected tuples of numbers and texts in Net"):
+        to_tree(Net((np.zeros(2),)))
+
+
+def test_a_log_that_leads_elsewhere_is_refused_and_left_alone(tmp_path):
+    bayespbrl.start("gridworld", tmp_path / "run", **QUICK)
+    (tmp_path / "secret").write_text("no line")
+    (tmp_path / "run" / "events.jsonl").symlink_to(tmp_path / "secret")
+    with pytest.raises(ValueError, match="expected a file of the run's own, got a link"):
+        runs.resume(tmp_path / "run")
+    assert (tmp_path / "secret").read_text() == "no line"
+
+
+def test_what_another_learner_writes_while_heavy_parts_are_written_is_noticed(tmp_path, monkeypatch):
+    learner = bayespbrl.start("gridworld", tmp_path / "run", **QUICK)
+    written = run_directory.write_iteration
+
+    def slowly(*arguments):
+        written(*arguments)
+        with learner.log.log_file.open("a") as log:
+            log.write('{"event": "asked"}\n')
+
+    monkeypatch.setattr(run_directory, "write_iteration", slowly)
+    with pytest.raises(ValueError, match="events that another learner has written"):
+        learner.ask()
+    assert learner.log.log_file.read_text() == '{"event": "asked"}\n'
+
+
+def test_a_run_directory_is_found_from_another_directory_and_missed_when_gone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    learner = bayespbrl.start("gridworld", "run", **QUICK | {"utility": "linear-program"})
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    learner.ask()
+    shutil.rmtree(tmp_path / "run")
+    with pytest.raises(ValueError, match="expected the run directory, which is gone"):
+        learner.tell(["first"] * len(learner.ask()))
 
 
 def test_an_environment_as_its_name_makes_it_need_not_be_passed_again(tmp_path):

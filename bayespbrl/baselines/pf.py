@@ -28,6 +28,7 @@ from scipy.special import xlogy
 
 from bayespbrl import rollouts
 from bayespbrl.baselines.steps import Step
+from bayespbrl.envs.stepping import step_limit
 from bayespbrl.experts import Expert
 from bayespbrl.policies import TabularPolicy
 from bayespbrl.preferences import Answer, parse_answer
@@ -55,7 +56,7 @@ def programming_by_feedback(
     dynamics: Any = getattr(environment.unwrapped, "dynamics", None)
     if not hasattr(dynamics, "transition_table"):
         raise ValueError(f"baseline pf: expected a task with a known transition_table, got {environment}")
-    table, steps = np.asarray(dynamics.transition_table()), rollouts.step_limit(environment, max_steps)
+    table, steps = np.asarray(dynamics.transition_table()), step_limit(environment, max_steps)
     rng = np.random.default_rng([seed, 0])
     points = rng.standard_normal((DRAWS, len(table)))  # the prior
     differences: list[np.ndarray] = []

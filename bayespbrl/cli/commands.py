@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import wraps
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -294,10 +295,15 @@ def results(
 def main() -> None:
     """Entry point. Bad input gives one line on standard error and exit status 2."""
     keep_compiled()
+    for stream in (sys.stdout, sys.stderr):  # R̂ in a file that is not UTF-8
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         status = app(standalone_mode=False)
     except (ValueError, OSError) as error:
         status = _print_error(str(error))
+    except MemoryError as error:
+        status = _print_error(f"memory: expected less to be asked for, got {error or 'no more'}")
     except (KeyboardInterrupt, typer.Abort):
         status = 130
     except typer.Exit as stop:

@@ -1,6 +1,7 @@
 """What the command line shows: progress, tables and pictures of runs and studies, and questions to a person."""
 
 import shlex
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from rich.table import Column, Table
 
 from bayespbrl.cli.opening import Place, open_in_browser, somebody_looks
 from bayespbrl.envs.opening import environment_attribute, open_environment
-from bayespbrl.experts import TerminalExpert
+from bayespbrl.experts import Expert, TerminalExpert
 from bayespbrl.figures import new_figure, png
 from bayespbrl.learner import Learner
 from bayespbrl.runs.files import write_file
@@ -49,7 +50,7 @@ def run_to_the_end(
             person = _person(learner, directory)
             learner.run(person, answerer=next(iter(answerers), None), progress=lambda now: console.print(_state(now)))
         else:
-            _run_with_bar(learner)
+            _run_with_bar(learner, _simulated(learner, directory))
     except KeyboardInterrupt:
         console.print(f"\nStopped. Nothing is lost: bayespbrl resume {directory}")
         raise
@@ -133,13 +134,23 @@ def _film(learner: Learner, directory: Path) -> str:
     return f"Final policy: {film} and {strip}"
 
 
-def _run_with_bar(learner: Learner) -> None:
+def _simulated(learner: Learner, directory: Path) -> Expert:
+    """The simulated expert; where none can be made, as of returns that are all equal, an empty run is removed."""
+    try:
+        return expert_of(learner)
+    except ValueError:
+        if not learner.state.iteration and not learner.state.queries:
+            shutil.rmtree(directory)
+        raise
+
+
+def _run_with_bar(learner: Learner, expert: Expert) -> None:
     console.print("The simulated expert answers according to the hidden reward.")
     with progress_bar() as bar:
         total, done = learner.settings.most_iterations, learner.state.iteration
         task = bar.add_task("iterations", total=total, completed=done, state=_state(learner))
         learner.run(
-            expert_of(learner),
+            expert,
             progress=lambda now: bar.update(task, completed=now.state.iteration, state=_state(now)),
         )
         ended = learner.state.iteration  # before the limit, where the answers are used up

@@ -81,13 +81,23 @@ def environment_name(env: gymnasium.Env) -> str:
     return type(inner.dynamics if isinstance(inner, FunctionalEnv) else inner).__name__
 
 
-def given_by_name(environment: object) -> bool:
-    """Whether the name alone opens the same environment again.
+def reopened(environment: object) -> str:
+    """How the name alone opens the same environment again, by a value of the setting `environment`.
 
-    It does not for an environment that was made with other arguments, wrapped, or never registered.
+    `named`: by its name. `object`: made by gymnasium from its name; an object is stepped alone, where many copies of a
+    name are stepped side by side. `other`: not at all, since it was made with other arguments, wrapped, or never
+    registered.
     """
-    if isinstance(environment, str):
-        return True
+    if isinstance(environment, str | EnvSpec):
+        return "named" if isinstance(environment, str) or given_by_name(environment) else "other"
+    if not given_by_name(environment):
+        return "other"
+    pure = isinstance(environment, gymnasium.Env) and isinstance(environment.unwrapped, FunctionalEnv)
+    return "named" if pure else "object"
+
+
+def given_by_name(environment: object) -> bool:
+    """Whether an environment or spec is what gymnasium makes of its name, as far as its arguments tell."""
     spec = environment if isinstance(environment, EnvSpec) else getattr(environment, "spec", None)
     if spec is None or (registered := gymnasium.registry.get(spec.id)) is None:
         return False
@@ -211,13 +221,14 @@ def to_plain(
     """An observation of `space`, flattened, one-hot where it is discrete and `actions` are not.
 
     Raises:
-      ValueError: one that is not in a discrete space, or whose parts are not those of the space.
+      ValueError: one that cannot be one-hot, or whose parts are not those of the space.
     """
-    if isinstance(space, Discrete):
-        number = np.int64(value - space.start)
-        if not 0 <= number < space.n:
+    if isinstance(space, Discrete) and isinstance(actions, Box):
+        if not space.start <= value < space.start + space.n:
             raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
-        return np.eye(int(space.n))[number] if isinstance(actions, Box) else number
+        return np.eye(int(space.n))[int(value - space.start)]
+    if isinstance(space, Discrete):
+        return np.int64(value - space.start)
     if isinstance(space, Box):
         return np.reshape(value, -1)
     try:

@@ -9,15 +9,46 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import TimeLimit
 from jaxtyping import Bool, Float, Shaped
 from numpy.typing import ArrayLike
 
-from bayespbrl.envs.opening import as_given, environment_name, flattened, made_from
+from bayespbrl.checks import whole
+from bayespbrl.envs.functional import FunctionalEnv
+from bayespbrl.envs.opening import (
+    AnyEnvironment,
+    as_given,
+    environment_attribute,
+    environment_name,
+    flattened,
+    layers,
+    made_from,
+    open_environment,
+)
 
 MAX_LANES = 128  # copies of an environment stepped side by side
 PROBES = 10  # episodes of random actions
 Rows = Shaped[np.ndarray, "n ..."]
 Episode = tuple[Rows, Rows, Float[np.ndarray, " t"], bool]
+
+
+def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int:
+    """The time limit that holds: `max_steps`, else the `TimeLimit` wrapper's, else the spec's, else the dynamics'.
+
+    An object of the user's, of which there are no copies with another limit, keeps its own where that is less.
+    """
+    env = open_environment(environment)
+    wrapped = [layer._max_episode_steps for layer in layers(env) if isinstance(layer, TimeLimit)]
+    if max_steps is not None:
+        own = [] if made_from(env) is not None or isinstance(env.unwrapped, FunctionalEnv) else wrapped
+        return min([whole("max_steps", max_steps), *own])
+    limits: list[int | None] = [min(wrapped, default=None)]
+    limits.append(env.spec.max_episode_steps if env.spec is not None else None)
+    limits.append(environment_attribute(env, "max_episode_steps"))
+    for limit in limits:
+        if limit is not None:
+            return int(limit)
+    raise ValueError(f"max_steps: expected a number, because {environment_name(env)} has no time limit, got None")
 
 
 def episodes_by_interface(

@@ -137,7 +137,7 @@ class Page:
 
     async def _file(self, request: Request) -> Response:
         name = request.url.path.rpartition("/")[2]
-        content = files("bayespbrl.people").joinpath(name).read_text()
+        content = files("bayespbrl.people").joinpath(name).read_text(encoding="utf-8")
         return Response(content, media_type=KINDS[name], headers=HEADERS)
 
     async def _clip(self, request: Request) -> Response:

@@ -30,8 +30,8 @@ class ComparisonWidget(anywidget.AnyWidget):
     """
 
     session: Session
-    _esm = (FOLDER / "front.js").read_text()
-    _css = (FOLDER / "front.css").read_text()
+    _esm = (FOLDER / "front.js").read_text(encoding="utf-8")
+    _css = (FOLDER / "front.css").read_text(encoding="utf-8")
     view = traitlets.Dict().tag(sync=True)
     first = traitlets.Bytes().tag(sync=True)
     second = traitlets.Bytes().tag(sync=True)

@@ -32,7 +32,7 @@ class RunDirectory:
     """A run directory, which is the learner's `Log`; `create` makes a new one, `open` finds an existing one."""
 
     def __init__(self, path: Path, settings: Settings):
-        self.path = path
+        self.path = path.absolute()  # a notebook may change its directory
         self.settings = settings
         self._end: int | None = None  # size of the log, in bytes, after this learner's last event
 
@@ -51,11 +51,11 @@ class RunDirectory:
             path.parent.mkdir(parents=True, exist_ok=True)
             building = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
             try:
-                building.chmod(0o755)
+                building.chmod(0o777 & ~_umask())
                 write_file(building / "settings.json", json.dumps(content, indent=2) + "\n")
                 (building / "iterations").mkdir()
                 building.rename(path)
-            except OSError:
+            except BaseException:
                 shutil.rmtree(building, ignore_errors=True)
                 raise
         except OSError as error:
@@ -81,6 +81,9 @@ class RunDirectory:
             )
         if not isinstance(content.get("env"), str):
             raise ValueError(f"{file}: expected the environment's name as env, got {content.get('env')!r}")
+        log = path / "events.jsonl"  # of a stranger's run, it may lead to another file
+        if log.is_symlink() or (log.exists() and not log.is_file()):
+            raise ValueError(f"{log}: expected a file of the run's own, got a link or something that is no file")
         known = {name: value for name, value in content.items() if name in OPTIONS}
         try:
             return cls(path, Settings.from_options(content["env"], known))
@@ -89,7 +92,12 @@ class RunDirectory:
 
     def check_newest(self) -> None:
         """`ValueError` where another learner has written to the run since this one's last event."""
-        if self._end is not None and self._end != self._log_size():
+        if not self.path.exists():
+            raise ValueError(f"{self.path}: expected the run directory, which is gone")
+        self._check_size(self._log_size())
+
+    def _check_size(self, size: int) -> None:
+        if self._end is not None and self._end != size:
             raise ValueError(
                 f"{self.path}: expected the run as this learner left it, got events that another learner has written; "
                 "resume the run to continue from there"
@@ -107,6 +115,7 @@ class RunDirectory:
         line = (json.dumps(dict(entry.event), allow_nan=False) + "\n").encode()
         with self.log_file.open("ab", buffering=0) as file:
             before = file.tell()
+            self._check_size(before)  # the heavy parts took their time
             try:
                 if file.write(line) != len(line):
                     raise OSError(f"{file.name}: the line was not written whole")
@@ -271,3 +280,10 @@ def fresh_directory(env: str) -> Path:
     stem = f"{env.replace('/', '-').lower()}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
     names = (Path("runs") / (stem if number == 1 else f"{stem}-{number}") for number in count(1))
     return next(path for path in names if not path.exists())
+
+
+def _umask() -> int:
+    """The permissions that the user's new files do not get; it can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -33,11 +33,22 @@ def written_aside(file: Path) -> Iterator[Path]:
         with aside.open("r+b") as written:
             os.fsync(written.fileno())
         aside.replace(file)
+        _synchronise(file.parent)
     except BaseException as error:
         aside.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno is not None and error.filename is None:  # a full disk
             raise OSError(error.errno, error.strerror, str(file)) from error
         raise
+
+
+def _synchronise(directory: Path) -> None:
+    """Flush a directory, so that a file in it has its name after a power failure; not every system can."""
+    with suppress(OSError):
+        opened = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
 def _drop_stale(directory: Path) -> None:

@@ -8,7 +8,15 @@ import numpy as np
 
 from bayespbrl import checks, rollouts
 from bayespbrl.envs import pictures
-from bayespbrl.envs.opening import environment_attribute, environment_name, flattened, made_from
+from bayespbrl.envs.opening import (
+    as_given,
+    environment_attribute,
+    environment_name,
+    flattened,
+    given_by_name,
+    made_from,
+)
+from bayespbrl.envs.stepping import step_limit
 from bayespbrl.learner import Learner
 from bayespbrl.policies.actor import Actor
 from bayespbrl.runs.files import written_aside
@@ -58,7 +66,7 @@ def film_policy(learner: Learner, directory: Path) -> tuple[Path, Path]:
 def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
     """Pictures of one episode that the environment renders, and the milliseconds for which to show each."""
     env, settings = rendering(learner.environment), learner.settings
-    limit = rollouts.step_limit(learner.environment, settings.rollouts.max_steps)
+    limit = step_limit(learner.environment, settings.rollouts.max_steps)
     shape, rng = env.observation_space.shape or (), np.random.default_rng(settings.seed)
     actor = Actor(learner.policy, env.action_space, rng, observation_shape=shape)
     stride = 1
@@ -81,12 +89,14 @@ def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
 
 
 def rendering(environment: gymnasium.Env) -> gymnasium.Env:
-    """The environment in a mode that renders: made again where its id was given, else the user's object.
+    """The environment in a mode that renders: made again where its name says how, else the user's object.
 
     Raises:
       ValueError: it has no mode `rgb_array`, or is an object in another mode.
     """
-    spec = made_from(environment)
+    spec, given = made_from(environment), as_given(environment)
+    if spec is None and environment.render_mode != "rgb_array" and given_by_name(given):
+        spec = given.spec
     if spec is None:
         if environment.render_mode != "rgb_array":
             raise ValueError(f"expected render_mode rgb_array, got {environment.render_mode}")

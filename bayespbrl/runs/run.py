@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 import xarray as xr
@@ -20,6 +21,7 @@ from bayespbrl.preferences import Preferences
 from bayespbrl.queries import QueryRule, highest_utility
 from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.runs.directory import RunDirectory, fresh_directory
+from bayespbrl.runs.stored_classes import classes_of, from_tree, to_tree
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import UtilityEstimate
@@ -42,6 +44,8 @@ def start(
       ValueError: bad options, or a directory that exists; nothing is left behind then.
     """
     learner = Learner(env, **options)
+    if learner.own_policy is not None:  # better now than after the first answers
+        from_tree(to_tree(learner.own_policy), known=classes_of(learner.own_policy))
     path = fresh_directory(learner.settings.env) if directory is None else directory
     return learner.logged(RunDirectory.create(path, learner.settings))
 
@@ -120,9 +124,11 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
     if settings.environment == "other" and env is None:
         raise ValueError(f"{log.path}: expected env= again, which the run was started with, got None")
     summarised, policy = log.summarised(), own["policy"]
-    entries = log.entries(features=own["features"], known=() if policy is None else (type(policy),))
+    entries = log.entries(features=own["features"], known=() if policy is None else classes_of(policy))
     try:
-        learner = Learner(settings.env if env is None else env, **own, entries=entries, kept=settings)
+        if env is None:
+            env = gymnasium.make(settings.env) if settings.environment == "object" else settings.env
+        learner = Learner(env, **own, entries=entries, kept=settings)
         log.check_complete(learner.state, summarised)
         for trajectory in learner.trajectories:  # of another environment, where env= is a wrong one
             check_of_space("states of the run", trajectory.states, learner.environment.observation_space)

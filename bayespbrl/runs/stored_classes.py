@@ -60,8 +60,22 @@ def to_tree(instance: Any, *, without: Collection[str] = ()) -> xr.DataTree:
                 f"stored class: expected an array, number or text in {type(instance).__name__}.{name}, "
                 f"got {type(value).__name__}"
             )
-    attributes = {"class": stored_name(type(instance)), "fields": json.dumps(plain)}
+    try:
+        attributes = {"class": stored_name(type(instance)), "fields": json.dumps(plain)}
+    except TypeError as error:
+        name = type(instance).__name__
+        raise ValueError(
+            f"stored class: expected tuples of numbers and texts in {name}, got others: {error}"
+        ) from error
     return xr.DataTree(xr.Dataset(arrays, attrs=attributes), children=children)
+
+
+def classes_of(instance: Any) -> tuple[type, ...]:
+    """The class of a dataclass instance, and those of the dataclasses in its fields."""
+    fields = dataclasses.fields(instance) if dataclasses.is_dataclass(instance) else ()
+    parts = [getattr(instance, field.name) for field in fields]
+    inner = [kind for part in parts if dataclasses.is_dataclass(part) for kind in classes_of(part)]
+    return tuple(dict.fromkeys([type(instance), *inner]))
 
 
 def from_tree(tree: xr.DataTree, *, known: Iterable[type] = (), given: Mapping[str, Any] | None = None) -> Any:

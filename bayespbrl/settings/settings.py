@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, cast
 
+import numpy as np
+
 from bayespbrl import checks
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import RadialBasisOptions
@@ -26,6 +28,7 @@ from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 LAST_ITERATIONS = 5  # after the last answer: the policy catches up with what is known
 INFERRED: dict[str, Any] = {"steepness": None, "lapse_rate": None}  # unless they or all hyperparameters are given
 MOST_UNASKED = 10  # in a row; then more answers would change little
+MOST_TRAJECTORIES = 100_000  # an iteration; of a damaged or foreign run, they are room that is made
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,9 @@ class Rollouts:
     initial_action_scale: float = 0.75
 
     def __post_init__(self) -> None:
-        checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
+        number = checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
+        if number > MOST_TRAJECTORIES:
+            raise ValueError(f"trajectories_per_iteration: expected at most {MOST_TRAJECTORIES}, got {number}")
         checks.optional(checks.whole, "max_steps", self.max_steps)
         checks.optional(checks.whole, "exploration_hold", self.exploration_hold)
         checks.whole("evaluation_episodes", self.evaluation_episodes)
@@ -120,7 +125,8 @@ class Settings:
       seed: of every random choice of the run.
       preset: `default`, or `paper`, the paper's protocol; all other options say what it came to.
       iterations: most cycles of the four steps; None: they follow from the budget of answers.
-      environment: `named`, which `env` opens again, or `other`, an object of the user's.
+      environment: `named`, which `env` opens again; `object`, which gymnasium makes of `env`; or `other`, an object of
+        the user's.
       expert, wrong_answers: who answers, and the share of a simulated expert's answers that are reversed; a stopped run
         finds its expert again by them.
       model, estimation, features, critic, update, rollouts, questions: the options of each part, documented there:
@@ -150,7 +156,7 @@ class Settings:
             checks.whole("iterations", self.iterations)
         elif self.questions.answers is None:
             raise ValueError("iterations: expected a number, because there is no budget of answers, got None")
-        checks.one_of("environment", self.environment, ("named", "other"))
+        checks.one_of("environment", self.environment, ("named", "object", "other"))
         checks.one_of("expert", self.expert, (*SIMULATED, "page", "terminal", "other"))
         checks.share("wrong_answers", self.wrong_answers)
         self._check_together()
@@ -186,7 +192,7 @@ class Settings:
             raise ValueError(f"settings: expected options among {', '.join(sorted(OPTIONS))}, got {', '.join(unknown)}")
         parts: dict[str, dict[str, Any]] = {name: {} for name in ("", *PARTS)}
         for name, value in options.items():
-            parts[OPTIONS[name]][name] = value
+            parts[OPTIONS[name]][name] = value.item() if isinstance(value, np.generic) else value
         if parts["estimation"].get("hyperparameters", Estimation.hyperparameters) == "inferred":
             parts["model"] = INFERRED | parts["model"]
         own = parts.pop("")

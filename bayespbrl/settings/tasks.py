@@ -12,8 +12,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 from jaxtyping import Float
 
-from bayespbrl.envs.stepping import random_episodes
-from bayespbrl.rollouts import step_limit
+from bayespbrl.envs.stepping import random_episodes, step_limit
 
 # Trajectories of an iteration where actions are continuous; steps that the first ones should have in all, and the most
 # trajectories that an iteration may take for them.
