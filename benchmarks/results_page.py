@@ -128,7 +128,7 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
     """
     row = cheapest(data)
     if row is None or data.description.get("version") != version("bayespbrl"):
-        print(f"study {data.name}: of version {data.description.get('version')}, not run again.")
+        print(f"study {data.name}: nothing is run again (version {data.description.get('version')}).")
         return []
     seed, entries = row.seeds[0], again(row, processes)
     kept = row.lines[row.lines["seed"] == seed]

@@ -743,6 +743,16 @@ def test_a_run_of_an_object_of_a_registered_environment_goes_on_bit_for_bit(tmp_
     assert fingerprint(resumed) == fingerprint(whole)
 
 
+def test_a_run_of_an_object_that_nobody_registers_any_more_is_one_line(tmp_path):
+    gymnasium.register("Gone-v0", entry_point=Corridor, max_episode_steps=5)
+    try:
+        bayespbrl.start(gymnasium.make("Gone-v0"), tmp_path / "run", **QUICK)
+    finally:
+        del gymnasium.registry["Gone-v0"]
+    with pytest.raises(ValueError, match=r"expected gridworld, .* or a registered gymnasium id, got 'Gone-v0'"):
+        bayespbrl.load(tmp_path / "run")
+
+
 def test_an_object_keeps_its_own_time_limit():
     assert step_limit(gymnasium.make("Pendulum-v1"), 500) == 200
     assert step_limit("Pendulum-v1", 500) == 500

@@ -46,7 +46,8 @@ def compare_likelihoods(
     """
     differences = checks.matrix("differences", differences)
     number = len(differences)
-    fold = _assigned_folds(answer_groups(groups, number), checks.whole("folds", folds, 2), seed=seed)
+    groups = answer_groups(groups, number)
+    fold = _assigned_folds(groups, checks.whole("folds", folds, 2), seed=seed)
     tied = np.zeros(number, dtype=bool) if indifferent is None else checks.flags("indifferent", indifferent, number)
     if not candidates:
         raise ValueError("candidates: expected at least one, got none")
@@ -60,7 +61,7 @@ def compare_likelihoods(
         for model in candidates.values()
     ]
     log_probability, converged = (np.array(values) for values in zip(*results, strict=True))
-    return _table(list(candidates), log_probability, converged, fold, answer_groups(groups, number))
+    return _table(list(candidates), log_probability, converged, fold, groups)
 
 
 def plot_comparison(result: xr.Dataset, axes: Axes) -> Axes:

@@ -88,12 +88,17 @@ def reopened(environment: object) -> str:
     name are stepped side by side. `other`: not at all, since it was made with other arguments, wrapped, or never
     registered.
     """
-    if isinstance(environment, str | EnvSpec):
-        return "named" if isinstance(environment, str) or given_by_name(environment) else "other"
+    if isinstance(environment, str):
+        return "named"
     if not given_by_name(environment):
         return "other"
-    pure = isinstance(environment, gymnasium.Env) and isinstance(environment.unwrapped, FunctionalEnv)
-    return "named" if pure else "object"
+    stepped = isinstance(environment, gymnasium.Env) and not isinstance(environment.unwrapped, FunctionalEnv)
+    return "object" if stepped else "named"
+
+
+def made_again(name: str) -> gymnasium.Env:
+    """The object that gymnasium makes of a name, as for a run that was started with one; `ValueError` if it cannot."""
+    return _make(_spec(name))
 
 
 def given_by_name(environment: object) -> bool:

@@ -100,12 +100,10 @@ class StudyData:
         if declared.of_scale:
             return None
         for axis in range(1, len(AXES)):
-            for other in self.declaration.rows:
-                same = [a == b for a, b in zip(declared.levels, other.levels, strict=True)]
-                if all(same[:axis] + same[axis + 1 :]) and not other.of_scale:
-                    if other is declared:
-                        break
-                    return other
+            rest = declared.levels[:axis] + declared.levels[axis + 1 :]
+            alike = (row for row in self.declaration.rows if row.levels[:axis] + row.levels[axis + 1 :] == rest)
+            if (first := next(row for row in alike if not row.of_scale)) is not declared:
+                return first
         return None
 
     def floor(self, task: str) -> float | None:

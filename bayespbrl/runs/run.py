@@ -5,13 +5,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import jax
 import numpy as np
 import xarray as xr
 
 from bayespbrl import rollouts
-from bayespbrl.envs.opening import AnyEnvironment, check_of_space, from_plain, imported_by_name, to_plain
+from bayespbrl.envs.opening import (
+    AnyEnvironment,
+    check_of_space,
+    from_plain,
+    imported_by_name,
+    made_again,
+    to_plain,
+)
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
@@ -127,7 +133,7 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
     entries = log.entries(features=own["features"], known=() if policy is None else classes_of(policy))
     try:
         if env is None:
-            env = gymnasium.make(settings.env) if settings.environment == "object" else settings.env
+            env = made_again(settings.env) if settings.environment == "object" else settings.env
         learner = Learner(env, **own, entries=entries, kept=settings)
         log.check_complete(learner.state, summarised)
         for trajectory in learner.trajectories:  # of another environment, where env= is a wrong one

@@ -38,9 +38,10 @@ def _value(contents: RunContents, iterations: xr.Dataset) -> str:
     episodes = count(contents.settings.rollouts.evaluation_episodes, "fresh episode")
     text = f"After {so_far} the policy's value, the mean return of {episodes}, is {number(value[-1])}"
     optimum = contents.environment_attribute("optimal_return")
-    if optimum is not None:
-        share = f"{percent(value[-1] / optimum, 1)} of " if optimum > 0 else ""
-        text += f", {share}the optimum {number(optimum)}" if share else f"; the optimum is {number(optimum)}"
+    if optimum is not None and optimum > 0:
+        text += f", {percent(value[-1] / optimum, 1)} of the optimum {number(optimum)}"
+    elif optimum is not None:
+        text += f"; the optimum is {number(optimum)}"
     if not np.ptp(value) and not value[0]:
         return f"{text}: the environment may give no reward."
     best = int(np.argmax(value))

@@ -133,10 +133,12 @@ def _of_value(table: xr.Dataset) -> Iterator[ReportWarning]:
 def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWarning]:
     question = answers["question"].values
     if (against := question[contradicted(answers)]).size:
-        allowed = "" if contents.without_posterior else ", the lapse rate allows for them, unless it is set"
+        mistakes = (
+            "nothing is wrong" if contents.without_posterior else "the lapse rate allows for them, unless it is set"
+        )
         yield ReportWarning(
             f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
-            f"See the pictures below. If these answers are mistakes{allowed or ', nothing is wrong'}. If they are "
+            f"See the pictures below. If these answers are mistakes, {mistakes}. If they are "
             "right, the features cannot express what matters: use features of your own, or more centres where states "
             "are continuous.",
         )
