@@ -420,3 +420,15 @@ def test_an_unknown_method_is_refused():
         estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method="median", discount=0.9)
     with pytest.raises(ValueError, match=r"method: expected .*posterior-mean.*got 'median'"):
         inference.infer_utility(np.eye(3), [(1, 0)], method="median")
+
+
+def test_twenty_answers_find_the_one_of_eight_dimensions_that_matters():
+    rng = np.random.default_rng(5)
+    walks = np.cumsum(rng.normal(size=(70, 26, 8)), axis=1) + 3 * rng.normal(size=(70, 1, 8))
+    paths = [Trajectory(walk, np.zeros((25, 1)), walk[1:, 3]) for walk in walks]
+    features = RadialBasis(walks[:, ::5].reshape(-1, 8)[:200], np.full(8, 5.0), np.full(8, np.inf), normalised=True)
+    returns = np.array([path.total_reward for path in paths])
+    pairs = [(i, i + 1) if returns[i] > returns[i + 1] else (i + 1, i) for i in range(0, 40, 2)]
+    estimate = estimate_utility(paths, pairs, features, method="posterior-mean", discount=1.0)
+    unseen = paths[40:]
+    assert np.corrcoef(estimate.trajectory_utilities(unseen), returns[40:])[0, 1] > 0.98
