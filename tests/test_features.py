@@ -345,14 +345,13 @@ def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, cons
         np.testing.assert_allclose(total, expected, rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.parametrize(("dimensions", "alone"), [(4, 8), (8, 16), (12, 24), (17, 24), (40, 24)])
-def test_in_many_dimensions_the_settings_of_the_prior_are_as_many_and_let_few_matter(dimensions, alone):
+@pytest.mark.parametrize(("dimensions", "alone"), [(8, 16), (12, 24), (17, 24), (40, 24)])
+def test_in_many_dimensions_the_settings_of_the_prior_are_as_many_and_let_one_matter_alone(dimensions, alone):
     features = RadialBasis(np.zeros((3, dimensions)), np.ones(dimensions), np.full(dimensions, np.inf))
     multiples = settings(features, inferred=True, rng=np.random.default_rng(0))
     assert len(multiples) == len(np.unique(multiples, axis=0)) == 27
     assert {tuple(row) for row in multiples} >= {(multiple,) * dimensions for multiple in (1.0, 3.0, 9.0)}
     mattering = np.sum(multiples < 9.0, axis=1)
     assert np.sum(mattering == 1) == alone
-    assert set(mattering.tolist()) <= {0, 1, 2, 3, dimensions}
-    if dimensions <= 17:  # each dimension matters alone in some setting
+    if dimensions <= 24:  # each dimension in some setting
         assert np.all(np.any(multiples[mattering == 1] < 9.0, axis=0))
