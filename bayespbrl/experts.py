@@ -5,7 +5,7 @@ must depend on the two trajectories only: a resumed run may ask a question again
 """
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
@@ -18,7 +18,8 @@ from bayespbrl import checks
 from bayespbrl.preferences import Answer, parse_answer
 from bayespbrl.trajectories import Trajectory
 
-TIE_TOLERANCE = 1e-9  # relative: rounding in another order of summation must not decide
+# Of the sum of the absolute rewards: rounding in another order of summation must not decide.
+TIE_TOLERANCE = 1e-9
 # Ends of the seeds, so that one expert within another with the same seed errs independently. `NoisyExpert` has none.
 TEACHER, MARGIN = 1, 2
 
@@ -33,7 +34,7 @@ class ReturnExpert:
     """The simulated expert of the paper: prefers the higher undiscounted sum of the hidden reward, without noise."""
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
-        return _preferred(first.total_reward, second.total_reward)
+        return _preferred(first, second, (first.total_reward, second.total_reward))
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Teacher:
         if abs(returns[0] - returns[1]) < self.equal_within:
             return Answer.TIE
         seen = [_discounted_from_the_end(each.rewards, self.discount) for each in (first, second)]
-        answer = _preferred(*seen)
+        answer = _preferred(first, second, seen)
         # Lee et al. (2021), section 3: Bradley & Terry (1952) with β
         wrong = 0.0 if np.isinf(self.rationality) else expit(-self.rationality * abs(seen[0] - seen[1]))
         # wrong either by chance or by mistake; both at once are right
@@ -147,16 +148,17 @@ class MarginExpert:
         return 0.5 - share / 2 * (1 - np.log(share)) if share else 0.5
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
-        answer = _preferred(first.total_reward, second.total_reward)
+        answer = _preferred(first, second, (first.total_reward, second.total_reward))
         wrong = self.error_probability(first.total_reward - second.total_reward)
         return _reversed(answer) if _chance(self.seed, first, second, MARGIN) < wrong else answer
 
 
-def _preferred(first: float, second: float) -> Answer:
-    """The answer by two returns; a tie where they are equal but for rounding."""
-    if abs(first - second) <= TIE_TOLERANCE * max(abs(first), abs(second)):
+def _preferred(first: Trajectory, second: Trajectory, returns: Sequence[float]) -> Answer:
+    """The answer by the returns of both; a tie where they are equal but for rounding."""
+    difference = returns[0] - returns[1]
+    if abs(difference) <= TIE_TOLERANCE * max(float(np.sum(np.abs(each.rewards))) for each in (first, second)):
         return Answer.TIE
-    return Answer.FIRST if first > second else Answer.SECOND
+    return Answer.FIRST if difference > 0 else Answer.SECOND
 
 
 def _reversed(answer: Answer) -> Answer:

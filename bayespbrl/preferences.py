@@ -170,6 +170,8 @@ class Preferences:
         """
         if rivals is None and (not self.undominated or incumbent != self.undominated[-1]):
             raise ValueError(f"incumbent: expected the last of the undominated {self.undominated}, got {incumbent}")
+        if newcomer == incumbent:
+            raise ValueError(f"newcomer: expected another trajectory than the incumbent, got {newcomer}")
         if preferred not in (None, newcomer, incumbent):
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
         beside = self.undominated if rivals is None else tuple(each for each in rivals if each in self.undominated)
@@ -214,6 +216,8 @@ class Preferences:
 
         Decision: the undominated trajectories stay. Answers that contradict each other are for the posterior to weigh.
         """
+        if preferred not in (None, first, second):
+            raise ValueError(f"preferred: expected {first}, {second} or None, got {preferred}")
         other = second if preferred == first else first
         pairs, ties = self.pairs, self.ties
         asked = (first, second) if preferred is None else (preferred, other)
@@ -226,6 +230,8 @@ class Preferences:
 
     def without(self, answerer: str | None) -> "Preferences":
         """The preferences without one person's answers; the undominated trajectories stay.
+
+        Answers are counted by the side that was shown first, which has to be known of each.
 
         Raises:
           ValueError: a name that nobody who answered has.

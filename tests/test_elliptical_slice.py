@@ -419,6 +419,12 @@ def test_a_reference_that_is_no_gaussian_is_refused(reference, message):
         EllipticalSlice(regression, reference=reference)
 
 
+def test_a_reference_of_another_size_than_the_model_is_refused():
+    kernel = EllipticalSlice(regression, reference=(np.zeros(2), np.eye(2)))
+    with pytest.raises(ValueError, match="reference: expected a mean of the model's 3 values, got 2"):
+        kernel.init(jax.random.key(0), 0, None, (X, Y))
+
+
 @pytest.mark.slow
 def test_a_likelihood_that_is_impossible_everywhere_is_flagged_where_arviz_looks():
     def impossible(value):

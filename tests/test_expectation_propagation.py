@@ -13,6 +13,7 @@ from bayespbrl.models.likelihoods import (
     WithTies,
     log_prob,
 )
+from bayespbrl.utility import infer_utility
 
 LIKELIHOODS = [Mixed(5.0, 3.0), Mixed(200.0, 41.0), Mixed(0.01, 2.0), Logistic(3.0), WithLapses(Mixed(5.0, 3.0), 0.2)]
 
@@ -41,6 +42,21 @@ def test_tilted_moments_agree_with_quadrature_at_any_steepness(likelihood, mean,
     np.testing.assert_allclose(log_z, np.log(total), atol=1e-9)
     np.testing.assert_allclose(tilted_mean, first, atol=1e-8 * deviation)
     np.testing.assert_allclose(variance, second, rtol=1e-6)
+
+
+@pytest.mark.parametrize("mean", [-36.0, -40.0, -1000.0])
+def test_of_an_answer_that_only_a_lapse_explains_the_probability_is_that_of_a_lapse(mean):
+    mixture = WithLapses(Probit(1e9), 0.2).probit_mixture()
+    log_z, tilted_mean, variance = tilted_moments(np.array([mean]), np.ones(1), mixture)
+    np.testing.assert_allclose([log_z[0], tilted_mean[0], variance[0]], [np.log(0.1), mean, 1.0], rtol=1e-6)
+
+
+def test_two_items_that_hardly_differ_may_be_ordered_and_others_tied():
+    items = [[0, 0], [1, 0], [0, 1], [1.004, 0.003]]
+    estimate = infer_utility(items, [(1, 0), (3, 1)], ties=[(2, 0)], likelihood="probit", steepness=100.0)
+    utilities = estimate.utilities(np.array(items))
+    assert np.all(np.isfinite(utilities))
+    assert utilities[1] > utilities[0]
 
 
 @pytest.mark.parametrize("likelihood", LIKELIHOODS)

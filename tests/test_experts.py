@@ -35,6 +35,9 @@ def test_equal_returns_tie_whatever_the_order_of_the_sum():
     assert rewards.sum() != rewards[::-1].cumsum()[-1]  # rounding differs
     assert ReturnExpert()(trajectory(rewards), trajectory([rewards[::-1].cumsum()[-1]])) is Answer.TIE
     assert ReturnExpert()(trajectory([0.0]), trajectory([0.0, 0.0])) is Answer.TIE
+    cancelling = [0.1, 0.2, -0.3]
+    assert sum(cancelling) != sum(cancelling[::-1])
+    assert ReturnExpert()(trajectory(cancelling), trajectory(cancelling[::-1])) is Answer.TIE
 
 
 def test_a_small_but_real_difference_decides():

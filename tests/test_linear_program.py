@@ -43,3 +43,12 @@ def test_nothing_to_solve_is_the_origin():
 def test_bad_differences_are_named(bad):
     with pytest.raises(ValueError, match="differences: expected"):
         linear_program(bad)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-5, 1e5, 1e15])
+def test_the_unit_of_the_differences_does_not_matter(unit):
+    differences = np.array([[1.0, 0.3], [0.5, -1.0], [-0.2, 0.4]])
+    result = linear_program(unit * differences)
+    assert result.converged
+    np.testing.assert_allclose(result.weights, linear_program(differences).weights, atol=1e-6)
+    np.testing.assert_allclose(result.objective, 1.15 * unit, rtol=1e-6)

@@ -181,6 +181,9 @@ def test_weights_are_the_same_however_they_are_indexed(tree):
     np.testing.assert_array_equal(weights.isel(chain=1, draw=7).values, some[1, 7])
     np.testing.assert_array_equal(weights.isel(draw=[5, 2], feature=slice(1, 8, 3)).values, some[:, [5, 2], 1:8:3])
     np.testing.assert_array_equal(weights.isel(chain=0, draw=-1, feature=4).values, some[0, -1, 4])
+    np.testing.assert_array_equal(weights.isel(chain=0, feature=[0, 2]).values, some[0][:, [0, 2]])
+    np.testing.assert_array_equal(weights.isel(draw=3, feature=[0, 2]).values, some[:, 3, [0, 2]])
+    np.testing.assert_array_equal(weights.isel(chain=[1], feature=[2, 0]).values, some[1:2][..., [2, 0]])
 
 
 def test_mean_lies_in_the_row_space_and_most_likely_is_the_best_draw(tree):
@@ -336,20 +339,26 @@ def test_simulation_based_calibration_of_the_margins(number, dimension, scale, s
         w = scale * rng.normal(size=dimension)
         with jax.enable_x64(True):
             p = np.exp(np.asarray(log_prob(Mixed(steepness, float(number)), differences @ w)))
-        signs = np.where(rng.uniform(size=number) < p, 1.0, -1.0)
+        answered = differences * np.where(rng.uniform(size=number) < p, 1.0, -1.0)[:, None]
         tree = sample_posterior(
-            differences * signs[:, None],
+            answered,
             prior_scale=scale,
             steepness=steepness,
             num_samples=25,
             max_samples=25,
             seed=trial,
         )
-        # a fixed direction of w: margins flipped by their own answer would be no function of w alone
+        # A fixed direction of w: margins flipped by their own answer would be no function of w alone. Its ranks are
+        # uniform under draws of the prior too; those of the answers' likelihood, which depends on them, are not.
         drawn = tree["posterior/utility_weights"][:, :, 0].values.ravel()
-        ranks.append(np.sum(drawn < w[0]))
-    counts, _ = np.histogram(ranks, bins=np.linspace(-0.5, 100.5, 6))
-    assert stats.chisquare(counts, 120 * np.diff(np.ceil(np.linspace(-0.5, 100.5, 6))) / 101).pvalue > 1e-3
+        with jax.enable_x64(True):
+            margins = np.vstack([answered @ w, tree["posterior/margins"].values.reshape(-1, number)])
+            true, *those = np.asarray(log_prob(Mixed(steepness, float(number)), margins)).sum(axis=1)
+        ranks.append((np.sum(drawn < w[0]), np.sum(np.array(those) < true)))
+    expected = 120 * np.diff(np.ceil(np.linspace(-0.5, 100.5, 6))) / 101
+    for each in np.transpose(ranks):
+        counts, _ = np.histogram(each, bins=np.linspace(-0.5, 100.5, 6))
+        assert stats.chisquare(counts, expected).pvalue > 1e-3
 
 
 @pytest.mark.slow
@@ -387,6 +396,9 @@ def test_the_posterior_finds_the_length_scale_that_ordered_the_pairs():
         ({"shown_first": np.array([2, 0])}, "shown_first: expected 2 whole numbers in -1 … 1"),
         ({"answerers": np.array([0])}, "answerers: expected 2 whole numbers"),
         ({"differences": np.ones((0, 2, 3))}, "differences: expected shape"),
+        ({"differences": [[1.0], [1.0, 2.0]]}, "differences: expected rows of numbers"),
+        ({"differences": "abc"}, "differences: expected rows of numbers"),
+        ({"differences": {1: 2}}, "differences: expected rows of numbers"),
         ({"indifferent": np.array([True]), "tie_threshold": 0.1}, "indifferent: expected"),
         ({"tie_threshold": 0.0}, "tie_threshold: expected"),
     ],

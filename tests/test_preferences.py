@@ -87,6 +87,13 @@ def test_a_comparison_with_another_than_the_newest_undominated_one_is_refused(in
         Preferences().add(7, 0, preferred=7)
 
 
+def test_a_trajectory_is_compared_with_another_and_one_of_the_two_preferred():
+    with pytest.raises(ValueError, match="newcomer: expected another trajectory"):
+        Preferences(undominated=(0,)).add(0, 0, preferred=None)
+    with pytest.raises(ValueError, match="preferred: expected 0, 1 or None, got 7"):
+        Preferences(undominated=(0,)).add_repeated(0, 1, preferred=7)
+
+
 def test_differences_are_preferred_minus_dominated():
     features = np.array([[1.0, 2.0, 4.0], [0.5, -1.0, 3.0], [7.0, 0.0, 1.0]])
     differences = pair_differences(((0, 1), (2, 0)), features)

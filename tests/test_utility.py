@@ -363,6 +363,8 @@ BAD_ARGUMENTS = [
     ({"feature_sums": None}, "feature_sums: expected "),
     ({"feature_sums": "abc"}, "feature_sums: expected rows of numbers"),
     ({"feature_sums": [[1.0], [1.0, 2.0]]}, "feature_sums: expected rows of numbers"),
+    ({"feature_sums": np.zeros((3, 0))}, r"feature_sums: expected shape \(n, D >= 1\), got \(3, 0\)"),
+    ({"feature_sums": [[1e308], [-1e308], [0.0]]}, "feature_sums: differences: expected finite"),
     ({"pairs": None}, "pairs: expected pairs of integers, got None"),
     ({"pairs": [(0.5, 1.7)]}, r"pairs: expected pairs of integers, got \[\(0.5, 1.7\)\]"),
     ({"pairs": [(0, 1, 2)]}, "pairs: expected pairs of integers"),

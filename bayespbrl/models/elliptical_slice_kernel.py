@@ -130,6 +130,9 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
         sites = self._trace(key_model, {}, model_args, model_kwargs)
         self._check(sites, model_args, model_kwargs)
         z = {name: site["value"] for name, site in sites.items() if _is_latent(site)}
+        size = sum(jnp.size(value) for value in z.values())
+        if self._reference is not None and (known := np.size(self._reference[0])) != size:
+            raise ValueError(f"reference: expected a mean of the model's {size} values, got {known}")
         given = dict(init_params or {})
         if not set(given) <= set(z):
             raise ValueError(f"init_params: expected names among {sorted(z)}, got {sorted(given)}")

@@ -25,6 +25,7 @@ TOLERANCE = 1e-6  # change of the margins' moments, in standard deviations, that
 # sites grow by a factor at every sweep, until the linear algebra breaks down near 1e16.
 RUNAWAY = 1e12
 SAME = 1e-10  # of the cosine between two rows of L, below 1, where they are about the same margin
+FAR = 700.0  # exp of more is no number
 LOST = 1e-11  # of a tie's probability, over its two terms: less is rounding
 # Panels on which one factor of several answers is integrated: to where the Gaussian ends, in its standard deviations,
 # and narrower ones towards the offsets.
@@ -88,9 +89,10 @@ def tilted_moments(
     # terms relative to the largest keep their precision where all of Z is tiny
     log_cdf = log_ndtr(sign * x)
     top = np.max(np.where(weights != 0, log_cdf, -np.inf), axis=1, keepdims=True)
-    constant = mixture.constant * np.exp(np.minimum(-top[:, 0], 700))
-    density = weights * np.exp(-0.5 * x**2 - 0.5 * np.log(2 * np.pi) - top) / spread
-    terms = sign * weights * np.exp(log_cdf - top)
+    constant = mixture.constant * np.exp(np.minimum(-top[:, 0], FAR))
+    used = weights != 0  # what is not may be larger than any number relative to the largest that is
+    density = weights * np.exp(np.where(used, -0.5 * x**2 - 0.5 * np.log(2 * np.pi) - top, 0)) / spread
+    terms = sign * weights * np.exp(np.where(used, log_cdf - top, 0))
     z = np.maximum(constant + np.sum(terms, axis=1), np.finfo(float).tiny)
     # where nothing is left of a tie but rounding, it has no direction either
     lost = z <= LOST * (constant + np.sum(np.abs(terms), axis=1))
@@ -98,7 +100,10 @@ def tilted_moments(
     slope = np.where(lost, 0, np.sum(density, axis=1)) / z
     curvature = np.where(lost, 0, np.sum(-density * x / spread, axis=1)) / z - slope**2
     tilted_variance = variances + variances**2 * curvature
-    return top[:, 0] + np.log(z), means + variances * slope, np.maximum(tilted_variance, 1e-12 * variances)
+    with np.errstate(divide="ignore"):
+        alone = (top[:, 0] < -FAR) & (mixture.constant > 0)  # all else is nothing beside the constant
+        log_z = np.where(alone, np.log(mixture.constant), top[:, 0] + np.log(z))
+    return log_z, means + variances * slope, np.maximum(tilted_variance, 1e-12 * variances)
 
 
 def repeated_moments(

@@ -63,8 +63,8 @@ def fit_gaussian(
         used = used_rows(factors.loadings)
         approximation = _approximation(factors, likelihood, model.prior_scale)
         log_evidence = approximation.log_evidence
-        if not np.all(used):  # rows of zeros have a factor of their own; else nothing is compiled for a new K
-            log_evidence += float(np.sum(np.log(prob(likelihood, np.zeros(number))[~used])))
+        if not np.all(used):
+            log_evidence += _of_zero_rows(model, known, tied, ~used)
     return GaussianFit(differences, model, factors, likelihood, approximation, log_evidence)
 
 
@@ -89,6 +89,14 @@ def refitted(
         if approximation is None or not approximation.converged:
             approximation = _approximation(fit.factors, likelihood, model.prior_scale)
         return replace(fit, approximation=approximation)
+
+
+def _of_zero_rows(model: PreferenceModel, known: int, tied: np.ndarray | None, zero: np.ndarray) -> float:
+    """Σ log p of the answers whose rows are zero, by those of a preference and of a tie: a new K compiles nothing."""
+    either = None if tied is None and model.tie_threshold is None else np.array([False, True])
+    logarithms = np.log(prob(model.answer_likelihood(known, either), np.zeros(2)))
+    kinds = np.zeros(len(zero), dtype=int) if tied is None else tied.astype(int)
+    return float(np.sum(logarithms[kinds][zero]))
 
 
 def _which_tied(tied: ArrayLike | None, model: PreferenceModel, number: int) -> ArrayLike | None:

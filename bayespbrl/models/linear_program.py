@@ -44,7 +44,10 @@ def linear_program(differences: ArrayLike) -> LinearProgramResult:
     if number == 0 or dimension == 0:
         return LinearProgramResult(np.zeros(dimension), 0.0, "nothing to solve", True)
     # eq. 10, with c of eq. 9; variables (w, p, n): Ψw − p + n = 0, cost −Σ p_k + 2 Σ n_k
-    constraints = ca.DM(np.hstack([differences, -np.eye(number), np.eye(number)]))
+    largest = float(np.max(np.abs(differences)))
+    # the solver's tolerances are absolute; the weights are the same in any unit
+    scale = largest if largest > 0 and not 1e-3 < largest < 1e3 else 1.0
+    constraints = ca.DM(np.hstack([differences / scale, -np.eye(number), np.eye(number)]))
     cost = np.concatenate([np.zeros(dimension), -np.ones(number), 2 * np.ones(number)])
     solver = ca.conic(
         "linear_program",

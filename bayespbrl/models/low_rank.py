@@ -93,7 +93,7 @@ class UtilityWeights(BackendArray):
             for j, draw in enumerate(draws):
                 weights[i, j] = self.unit * self.draw(int(chain), int(draw))
         keep = tuple(0 if np.ndim(k) == 0 and not isinstance(k, slice) else slice(None) for k in key[:2])
-        return weights[(*keep, key[2])]
+        return weights[:, :, key[2]][keep]  # at once, an array would move its axis to the front
 
     def draw(self, chain: int, draw: int) -> Float[np.ndarray, " d"]:
         """One draw of w."""

@@ -74,7 +74,8 @@ def plain_draws(
         problem = conditional(chains.problem, jax.tree.map(lambda x: x[0], chains.unknowns))
         start = model.prior_scale * np.random.default_rng([seed, 5]).standard_normal(problem.loadings.shape[1])
         state = KERNEL.init(jax.random.key(seed), 0, {"utility_weights": start}, (problem,))
-        recorded = _moves(state, problem, draws - half, half // kept, length=kept)
+        between = half // kept
+        recorded = _moves(state, problem, draws - kept * between, between, length=kept)
         chains = replace(chains, draws=(_part(chains, *map(np.asarray, recorded)),))
         margins = margins_of(fits, chains, kept)[:, : kept // 2 * 2]
         report = chain_convergence(margins.reshape(2, kept // 2, -1))  # its halves as chains

@@ -80,7 +80,8 @@ def sample_posterior(
       answerers: who gave each answer, names or numbers from 0, shape (K,): each has a lapse rate and a side bias, under
         one prior. None: one answerer.
       number_of_preferences: K of eq. 8, where it is not the number of rows (an answer held out).
-      num_warmup: draws a chain that are discarded (burn-in); rounded up to whole chunks of min(num_samples, 25) draws.
+      num_warmup: draws a chain that are discarded (burn-in); rounded up to whole chunks of min(num_samples, 25) draws,
+        and once more as many where the references of the chains are fitted anew after it.
       num_samples: draws a chain to begin with, >= 4.
       max_samples: cap on the draws a chain.
       num_chains: >= 2, so that R̂ means something.
@@ -164,8 +165,9 @@ def posterior_draws(
 def _needs_better_references(chains: Chains, fit: GaussianFit, model: PreferenceModel) -> bool:
     """Whether references at the prior's means are far from the posterior.
 
-    Those of many answers are, and those of ties: under a threshold that is much smaller than expected, weights that are
-    moved from one setting to another no longer leave the margins of ties within it.
+    Those of many answers are, where their steepness or lapse rate is inferred or eq. 8 has its steps. Those of fewer
+    are, where a tie threshold is inferred: under one that is much smaller than expected, weights that are moved from
+    one setting to another no longer leave the margins of ties within it.
     """
     unknown = None in (model.steepness, model.lapse_rate) or has_steps(fit.likelihood)
     return unknown if chains.many else ties_of(fit.likelihood) is not None and model.tie_threshold is None

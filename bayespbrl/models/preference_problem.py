@@ -163,7 +163,7 @@ def padded_problem(
       likelihood: p.
       prior_scale: σ.
       mean: of the reference.
-      site_precisions: s >= 0 of the reference's precision I/σ² + Lᵀ diag(s) L.
+      site_precisions: s of the reference's precision I/σ² + Lᵀ diag(s) L, which is positive definite.
       rank_at_least: so that problems of different rank can be stacked.
     """
     number, rank = loadings.shape

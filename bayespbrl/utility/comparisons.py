@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from bayespbrl import checks
 from bayespbrl.features import StateFeatures
 from bayespbrl.models import Answers
 from bayespbrl.preferences import pair_differences
@@ -75,7 +76,8 @@ class Comparisons:
 
     def differences(self, feature_sums: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
         """ψ(preferred) − ψ(dominated) of each pair."""
-        return pair_differences(self.pairs, feature_sums)
+        with np.errstate(over="ignore"):  # what is no number is refused by name
+            return pair_differences(self.pairs, feature_sums)
 
 
 def normalised(differences: Float[np.ndarray, "k d"]) -> tuple[Float[np.ndarray, "k d"], float]:
@@ -87,6 +89,7 @@ def normalised(differences: Float[np.ndarray, "k d"]) -> tuple[Float[np.ndarray,
     and side bias mean the same under each.
     """
     largest = float(np.max(np.abs(differences), initial=0.0))
+    checks.finite("feature_sums: differences", largest)  # of two that are near the largest number
     if largest and not 1e-150 < largest < 1e150:  # its square is no number
         scaled, scale = normalised(differences / largest)
         return scaled, scale * largest

@@ -125,6 +125,8 @@ def infer_utility(
     checks.one_of("method", method, (*POSTERIOR_METHODS, "linear-program"))
     checks.seed(seed)
     sums = checks.matrix("feature_sums", feature_sums)
+    if not sums.shape[1]:
+        raise ValueError(f"feature_sums: expected shape (n, D >= 1), got {sums.shape}")
     every = np.concatenate([checks.pairs("pairs", pairs), checks.pairs("ties", ties)])
     tied = np.arange(len(every)) >= len(pairs)
     answers = Answers(tied if tied.any() else None, shown_first, answerers).checked(len(every))

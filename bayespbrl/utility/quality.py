@@ -11,7 +11,7 @@ class FitQuality:
     Attributes:
       converged: R̂ and effective sample size, or the linear program's status, are in order.
       status: in words.
-      pairs, pairs_satisfied: K, and the number of ordered pairs with a positive margin (eq. 6).
+      pairs, pairs_satisfied: the number of ordered pairs, ties left out, and of those with a positive margin (eq. 6).
       rhat_max, effective_sample_size_min: the worst of the margins and all else that is inferred (NaN where there are
         no draws).
       log_evidence: log marginal likelihood of the answers (NaN where there is no posterior).
