@@ -16,8 +16,8 @@ class Trajectory:
     """One trajectory of T steps; lists become arrays. It equals itself alone.
 
     Attributes:
-      states: s₀ … s_T as observed; shape (T+1, S) float64, or (T+1,) int64 where observations are discrete.
-      actions: a₀ … a_{T−1}; shape (T, A) float64, or (T,) int64 where actions are discrete.
+      states: s₀ … s_T as observed; shape (T+1, S) float, or (T+1,) int where observations are discrete.
+      actions: a₀ … a_{T−1}; shape (T, A) float, or (T,) int where actions are discrete.
       rewards: the environment's hidden reward of each step. Only experts and evaluation read it.
       terminated: whether s_T is terminal (a time limit is not).
 

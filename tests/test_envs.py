@@ -20,6 +20,8 @@ from bayespbrl import envs
 from bayespbrl.envs import functional
 from bayespbrl.envs.opening import open_environment, to_plain
 from bayespbrl.envs.pictures import draw_trajectory, film, frames
+from bayespbrl.policies import SoftmaxPolicy
+from bayespbrl.rollouts import rollout
 
 IDS = list(envs.SHORT_NAMES.values())
 
@@ -261,3 +263,23 @@ def test_pure_functions_are_wrapped():
 
     dynamics = Still()
     assert open_environment(dynamics).unwrapped.dynamics is dynamics
+
+
+def test_an_environment_without_spaces_is_named():
+    with pytest.raises(ValueError, match="environment Env: expected a space as its observation_space, got None"):
+        open_environment(gymnasium.Env())
+
+
+def test_a_step_of_the_old_interface_is_refused_instead_of_its_info_being_taken_for_a_flag():
+    class Old(gymnasium.Env):
+        observation_space, action_space = Box(-1.0, 1.0, (2,)), Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(2, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(2, np.float32), 1.0, False, {"distance": 0.3}
+
+    policy = SoftmaxPolicy.initial(Old.observation_space, Old.action_space)
+    with pytest.raises(ValueError, match=r"environment Old failed at step 1: .*expected 5, got 4"):
+        rollout(Old(), policy, key=jax.random.key(0), episodes=2, max_steps=5)

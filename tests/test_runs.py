@@ -147,6 +147,12 @@ def test_the_policy_refuses_an_observation_of_another_shape(finished, observatio
         bayespbrl.load(finished).policy.act(observation)
 
 
+@pytest.mark.parametrize("observation", [25, -1, 2.7])
+def test_the_policy_refuses_an_observation_that_is_no_state(finished, observation):
+    with pytest.raises(ValueError, match=r"observation: expected one of Discrete\(25\), got "):
+        bayespbrl.load(finished).policy.act(observation)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(2, start=1), gymnasium.spaces.Box(-1, 1, (1, 2))])
 def test_the_policy_acts_in_the_environment_as_it_was_given(tmp_path, space):

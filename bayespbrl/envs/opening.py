@@ -174,6 +174,9 @@ def _make(spec: EnvSpec) -> gymnasium.Env:
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
     """`env` with 1-D `Box` spaces and `Discrete` spaces counted from 0; `env` itself where it has them already."""
+    for name in ("observation_space", "action_space"):
+        if not isinstance(space := getattr(env, name, None), Space):
+            raise ValueError(f"environment {environment_name(env)}: expected a space as its {name}, got {space!r}")
     given, observations, actions = env, env.observation_space, env.action_space
     if not observations.is_np_flattenable:
         raise ValueError(
@@ -229,9 +232,7 @@ def to_plain(
       ValueError: one that cannot be one-hot, or whose parts are not those of the space.
     """
     if isinstance(space, Discrete) and isinstance(actions, Box):
-        if not space.start <= value < space.start + space.n:
-            raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
-        return np.eye(int(space.n))[int(value - space.start)]
+        return np.eye(int(space.n))[int(checked_number(space, value) - space.start)]
     if isinstance(space, Discrete):
         return np.int64(value - space.start)
     if isinstance(space, Box):
@@ -240,6 +241,13 @@ def to_plain(
         return np.asarray(flatten(space, value), np.float64)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}") from error
+
+
+def checked_number(space: gymnasium.Space[Any], value: Any) -> Any:
+    """`value`; `ValueError` where the space is discrete and it is none of its numbers."""
+    if isinstance(space, Discrete) and not (space.start <= value < space.start + space.n and value == int(value)):
+        raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
+    return value
 
 
 def from_plain(space: Any, value: Any) -> np.ndarray | np.int64:

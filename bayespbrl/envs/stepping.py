@@ -122,7 +122,8 @@ class _Silent(gymnasium.Wrapper):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """A step without its info."""
-        return *self.env.step(action)[:4], {}
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        return observation, reward, bool(terminated), bool(truncated), {}
 
 
 class _Borrowed(_Silent):

@@ -27,7 +27,10 @@ async function post(message) {
         headers: { "Content-Type": "application/json", "Idempotency-Key": key },
         body: JSON.stringify(message),
       });
-      if (again) fire("msg:custom", { connection: "back" });
+      if (again) {
+        lost = null;
+        fire("msg:custom", { connection: "back" });
+      }
       if (reply.ok) return;
       fire("msg:custom", { refused: message.turn, say: reply.status === 409 ? ELSEWHERE : await reply.text() });
       return;

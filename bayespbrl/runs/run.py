@@ -13,6 +13,7 @@ from bayespbrl import rollouts
 from bayespbrl.envs.opening import (
     AnyEnvironment,
     check_of_space,
+    checked_number,
     from_plain,
     imported_by_name,
     made_again,
@@ -177,13 +178,14 @@ class Run:
 
     def _actor(self, policy: Sampler) -> Actor:
         environment, given = self.learner.environment, self.learner.given
+        space = given.observation_space
         return Actor(
             policy,
             environment.action_space,
             np.random.default_rng(),
-            observe=partial(to_plain, given.observation_space, actions=given.action_space),
+            observe=lambda value: to_plain(space, checked_number(space, value), given.action_space),
             enact=partial(from_plain, given.action_space),
-            observation_shape=given.observation_space.shape,
+            observation_shape=space.shape,
         )
 
     @property
