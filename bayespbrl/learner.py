@@ -16,7 +16,7 @@ from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
 from bayespbrl.policies import Policy, Sampler, greedy
-from bayespbrl.policies.choice import initial_policy
+from bayespbrl.policies.choice import fitting, initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
 from bayespbrl.settings import Settings, Task, settings_for
 from bayespbrl.trajectories import Trajectory
@@ -99,7 +99,7 @@ class Learner:
             _chosen("query", query, self.settings.questions.query, queries.QUERY_RULES),
         )
         self.log: Log | None = None
-        self.own_policy = own_policy
+        self.own_policy = None if own_policy is None else fitting(own_policy, *spaces)
         first = self.first_policy()
         self.state = events.replay(LearnerState(first, first, first), entries)
 

@@ -13,14 +13,14 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Sequence
 from gymnasium.utils.env_checker import check_env
 from matplotlib.figure import Figure
 from PIL import Image
-from toys import Odd
+from toys import Odd, Push
 
 import bayespbrl
 from bayespbrl import envs
 from bayespbrl.envs import functional
 from bayespbrl.envs.opening import open_environment, to_plain
 from bayespbrl.envs.pictures import draw_trajectory, film, frames
-from bayespbrl.policies import SoftmaxPolicy
+from bayespbrl.policies import LinearGaussianPolicy, SoftmaxPolicy
 from bayespbrl.rollouts import rollout
 
 IDS = list(envs.SHORT_NAMES.values())
@@ -283,3 +283,16 @@ def test_a_step_of_the_old_interface_is_refused_instead_of_its_info_being_taken_
     policy = SoftmaxPolicy.initial(Old.observation_space, Old.action_space)
     with pytest.raises(ValueError, match=r"environment Old failed at step 1: .*expected 5, got 4"):
         rollout(Old(), policy, key=jax.random.key(0), episodes=2, max_steps=5)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_largest_number_as_a_bound_of_actions_stands_for_none(dtype):
+    env = Push(3)
+    env.action_space = Box(-np.finfo(dtype).max, np.finfo(dtype).max, (1,), dtype)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # gymnasium's own, about so wide a space
+        opened = open_environment(env)
+    assert opened.action_space == Box(-np.inf, np.inf, (1,), dtype)
+    policy = LinearGaussianPolicy.initial(opened.observation_space, opened.action_space)
+    (path,) = rollout(env, policy, key=jax.random.key(0), episodes=1, max_steps=5)
+    assert 0 < np.abs(path.actions).max() < 10

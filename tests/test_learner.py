@@ -9,7 +9,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Box, Discrete
 from threadpoolctl import threadpool_info, threadpool_limits
 from toys import QUICK, Push, Slope, fingerprint
 
@@ -794,3 +794,19 @@ def test_exploration_is_held_for_a_share_of_the_first_episodes_where_they_end_ea
     options = {"centres": 10, "evaluation_episodes": 2, "trajectories_per_iteration": 3, "seed": 1}
     Learner(gymnasium.wrappers.TimeLimit(Push(80, ends=True), 400), iterations=2, **options).run(ReturnExpert())
     assert held == [10, 2]
+
+
+@pytest.mark.parametrize(
+    ("env", "policy"),
+    [
+        ("gridworld", TabularPolicy.initial(Discrete(25), Discrete(3))),
+        ("gridworld", TabularPolicy.initial(Discrete(10), Discrete(5))),
+        ("gridworld", LinearGaussianPolicy.initial(Box(-1, 1, (2,)), Box(-1, 1, (1,)))),
+        ("swing-up", LinearGaussianPolicy.initial(Box(-1, 1, (3,)), Box(-1, 1, (1,)))),
+        ("swing-up", LinearGaussianPolicy.initial(Box(-1, 1, (2,)), Box(-1, 1, (2,)))),
+        ("swing-up", TabularPolicy.initial(Discrete(25), Discrete(3))),
+    ],
+)
+def test_a_policy_that_does_not_suit_the_environment_is_refused(env, policy):
+    with pytest.raises(ValueError, match=r"policy: expected one from .* to .*, got "):
+        Learner(env, policy=policy)

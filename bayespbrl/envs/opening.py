@@ -21,6 +21,8 @@ from bayespbrl.envs.functional import FunctionalEnv
 OF_OBSERVATIONS = ("observation_period", "observation_names", "draw", "draw_trajectory", "pose", "grid_shape")
 AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
 
+NO_BOUND = 1e30  # an action's bound beyond it stands for none
+
 # Environments that we made from an id, and that can therefore be made again, N at a time.
 _MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
 # What `flattened` wrapped.
@@ -188,7 +190,7 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
         )
     if (plain := _plain_space(observations, actions)) is not observations:
         env = TransformObservation(env, lambda value: to_plain(observations, value, actions), plain)
-    if (plain := _plain_space(actions)) is not actions:
+    if (plain := _bounded(_plain_space(actions))) is not actions:
         env = TransformAction(env, lambda value: from_plain(actions, value), plain)
     if env is not given:
         _GIVEN[env] = given
@@ -211,6 +213,18 @@ def _plain_space(space: Space[Any], actions: Space[Any] | None = None) -> Box | 
         return Box(space.low.reshape(-1), space.high.reshape(-1), dtype=space.dtype.type)
     parts: Any = flatten_space(space)
     return Box(parts.low.astype(np.float64), parts.high.astype(np.float64), dtype=np.float64)
+
+
+def _bounded(space: Box | Discrete) -> Box | Discrete:
+    """The space without bounds that stand for none, such as the largest number: no exploration could reach them."""
+    if isinstance(space, Discrete):
+        return space
+    bounds = np.array([space.low, space.high])
+    none = np.isfinite(bounds) & (np.abs(bounds) > NO_BOUND)
+    if not none.any():
+        return space
+    low, high = np.where(none, np.copysign(np.inf, bounds), bounds)
+    return Box(low, high, dtype=space.dtype.type)
 
 
 def check_of_space(name: str, values: np.ndarray, space: gymnasium.Space[Any]) -> None:

@@ -1,15 +1,19 @@
 """Which kind of policy suits an environment's spaces."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
+import jax
+import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import ArrayLike
 
+from bayespbrl import checks
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
-from bayespbrl.policies.policy import Policy
+from bayespbrl.policies.policy import Policy, is_discrete
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
@@ -55,3 +59,30 @@ def initial_policy(
     if kind not in POLICIES:
         raise ValueError(f"policy: expected one of auto, {', '.join(POLICIES)}, got {kind!r}")
     return POLICIES[kind]((observation_space, action_space), action_scale, period)
+
+
+def fitting(policy: Policy, observation_space: Space[Any], action_space: Space[Any]) -> Policy:
+    """`policy`, tried at one observation.
+
+    Raises:
+      ValueError: one that does not take the observations of the one space or does not give the actions of the other.
+    """
+    if isinstance(observation_space, Discrete):
+        observation = np.asarray(observation_space.n - 1)  # the last: a smaller table has no row for it
+    else:
+        space = deepcopy(observation_space)
+        space.seed(0)
+        observation = np.asarray(space.sample(), np.float64)
+    expected: tuple[int, ...] = action_space.shape or (1, getattr(action_space, "n", 1))
+    try:
+        if isinstance(action_space, Discrete) != is_discrete(policy):
+            got: object = f"actions that are {'' if is_discrete(policy) else 'not '}discrete"
+        elif is_discrete(policy):
+            got = np.asarray(policy.probabilities(observation[None])).shape
+        else:
+            got = np.asarray(policy.sample(jax.random.key(0), observation)).shape
+    except Exception as error:
+        got = checks.reason(error)
+    if got != expected:
+        raise ValueError(f"policy: expected one from {observation_space} to {action_space}, got {got}")
+    return policy
