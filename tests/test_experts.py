@@ -36,7 +36,7 @@ def test_equal_returns_tie_whatever_the_order_of_the_sum():
     assert ReturnExpert()(trajectory(rewards), trajectory([rewards[::-1].cumsum()[-1]])) is Answer.TIE
     assert ReturnExpert()(trajectory([0.0]), trajectory([0.0, 0.0])) is Answer.TIE
     cancelling = [0.1, 0.2, -0.3]
-    assert sum(cancelling) != sum(cancelling[::-1])
+    assert np.sum(cancelling) != np.sum(cancelling[::-1])
     assert ReturnExpert()(trajectory(cancelling), trajectory(cancelling[::-1])) is Answer.TIE
 
 
