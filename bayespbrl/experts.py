@@ -148,7 +148,7 @@ class MarginExpert:
         return 0.5 - share / 2 * (1 - np.log(share)) if share else 0.5
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
-        answer = _preferred(first, second, (first.total_reward, second.total_reward))
+        answer = ReturnExpert()(first, second)
         wrong = self.error_probability(first.total_reward - second.total_reward)
         return _reversed(answer) if _chance(self.seed, first, second, MARGIN) < wrong else answer
 

@@ -5,6 +5,7 @@ import errno
 import json
 import multiprocessing
 import os
+import pickle
 import re
 import shutil
 import time
@@ -145,6 +146,12 @@ def test_the_policy_acts(finished):
 def test_the_policy_refuses_an_observation_of_another_shape(finished, observation):
     with pytest.raises(ValueError, match=r"observation: expected shape \(\), got \("):
         bayespbrl.load(finished).policy.act(observation)
+
+
+def test_the_policy_goes_to_other_processes(finished):
+    policy = bayespbrl.load(finished).policy
+    key = jax.random.key(3)
+    assert pickle.loads(pickle.dumps(policy)).act(12, key=key) == policy.act(12, key=key)
 
 
 @pytest.mark.parametrize("observation", [25, -1, 2.7])

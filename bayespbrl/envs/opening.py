@@ -246,7 +246,8 @@ def to_plain(
       ValueError: one that cannot be one-hot, or whose parts are not those of the space.
     """
     if isinstance(space, Discrete) and isinstance(actions, Box):
-        return np.eye(int(space.n))[int(checked_number(space, value) - space.start)]
+        _check_number(space, value)
+        return np.eye(int(space.n))[int(value - space.start)]
     if isinstance(space, Discrete):
         return np.int64(value - space.start)
     if isinstance(space, Box):
@@ -257,11 +258,16 @@ def to_plain(
         raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}") from error
 
 
-def checked_number(space: gymnasium.Space[Any], value: Any) -> Any:
-    """`value`; `ValueError` where the space is discrete and it is none of its numbers."""
-    if isinstance(space, Discrete) and not (space.start <= value < space.start + space.n and value == int(value)):
+def given_to_plain(space: gymnasium.Space[Any], value: Any, actions: gymnasium.Space[Any]) -> np.ndarray | np.int64:
+    """`to_plain` of an observation that the user gives; `ValueError` also for one outside a discrete space."""
+    if isinstance(space, Discrete):
+        _check_number(space, value)
+    return to_plain(space, value, actions)
+
+
+def _check_number(space: Discrete, value: Any) -> None:
+    if not (space.start <= value < space.start + space.n and value == int(value)):
         raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
-    return value
 
 
 def from_plain(space: Any, value: Any) -> np.ndarray | np.int64:

@@ -123,7 +123,7 @@ class _Silent(gymnasium.Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """A step without its info."""
         observation, reward, terminated, truncated, _ = self.env.step(action)
-        return observation, reward, bool(terminated), bool(truncated), {}
+        return observation, reward, terminated, truncated, {}
 
 
 class _Borrowed(_Silent):

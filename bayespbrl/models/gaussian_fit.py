@@ -57,14 +57,15 @@ def fit_gaussian(
         raise ValueError(f"differences: expected shape (K, D >= 1), got {differences.shape}")
     tied = None if indifferent is None else checks.flags("indifferent", indifferent, number)
     known = number if number_of_preferences is None else number_of_preferences
-    likelihood = model.answer_likelihood(known, _which_tied(tied, model, number))
+    which = _which_tied(tied, model, number)
+    likelihood = model.answer_likelihood(known, which)
     with one_blas_thread():
         factors = low_rank(differences)
         used = used_rows(factors.loadings)
         approximation = _approximation(factors, likelihood, model.prior_scale)
         log_evidence = approximation.log_evidence
         if not np.all(used):
-            log_evidence += _of_zero_rows(model, known, tied, ~used)
+            log_evidence += _of_zero_rows(model, known, which, ~used)
     return GaussianFit(differences, model, factors, likelihood, approximation, log_evidence)
 
 
@@ -91,11 +92,11 @@ def refitted(
         return replace(fit, approximation=approximation)
 
 
-def _of_zero_rows(model: PreferenceModel, known: int, tied: np.ndarray | None, zero: np.ndarray) -> float:
+def _of_zero_rows(model: PreferenceModel, known: int, tied: ArrayLike | None, zero: np.ndarray) -> float:
     """Σ log p of the answers whose rows are zero, by those of a preference and of a tie: a new K compiles nothing."""
-    either = None if tied is None and model.tie_threshold is None else np.array([False, True])
+    either = None if tied is None else np.array([False, True])
     logarithms = np.log(prob(model.answer_likelihood(known, either), np.zeros(2)))
-    kinds = np.zeros(len(zero), dtype=int) if tied is None else tied.astype(int)
+    kinds = np.zeros(len(zero), dtype=int) if tied is None else np.asarray(tied, dtype=int)
     return float(np.sum(logarithms[kinds][zero]))
 
 

@@ -27,10 +27,7 @@ async function post(message) {
         headers: { "Content-Type": "application/json", "Idempotency-Key": key },
         body: JSON.stringify(message),
       });
-      if (again) {
-        lost = null;
-        fire("msg:custom", { connection: "back" });
-      }
+      if (again) back();
       if (reply.ok) return;
       fire("msg:custom", { refused: message.turn, say: reply.status === 409 ? ELSEWHERE : await reply.text() });
       return;
@@ -71,6 +68,11 @@ async function take(view) {
 let source, lost = null;
 const over = () => ["finished", "failed"].includes(state.view.phase);
 
+function back() {
+  lost = null;
+  fire("msg:custom", { connection: "back" });
+}
+
 // Says that the server was not reached, and waits until it is time to try again.
 async function missed() {
   lost ??= performance.now();
@@ -83,8 +85,7 @@ function listen() {
   source = new EventSource("events");
   source.onmessage = (event) => take(JSON.parse(event.data));
   source.onopen = () => {
-    if (lost !== null) fire("msg:custom", { connection: "back" });
-    lost = null;
+    if (lost !== null) back();
   };
   source.onerror = async () => {
     source.close();

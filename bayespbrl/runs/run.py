@@ -13,11 +13,10 @@ from bayespbrl import rollouts
 from bayespbrl.envs.opening import (
     AnyEnvironment,
     check_of_space,
-    checked_number,
     from_plain,
+    given_to_plain,
     imported_by_name,
     made_again,
-    to_plain,
 )
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
@@ -178,14 +177,13 @@ class Run:
 
     def _actor(self, policy: Sampler) -> Actor:
         environment, given = self.learner.environment, self.learner.given
-        space = given.observation_space
         return Actor(
             policy,
             environment.action_space,
             np.random.default_rng(),
-            observe=lambda value: to_plain(space, checked_number(space, value), given.action_space),
+            observe=partial(given_to_plain, given.observation_space, actions=given.action_space),
             enact=partial(from_plain, given.action_space),
-            observation_shape=space.shape,
+            observation_shape=given.observation_space.shape,
         )
 
     @property

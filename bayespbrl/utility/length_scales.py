@@ -46,12 +46,8 @@ def _alone(dimensions: int, most: int, rng: np.random.Generator) -> set[tuple[fl
     four and six dimensions the default learned no better with them (docs/tuning.md).
     """
     *narrower, broadest = MULTIPLES
-    rows = [
-        tuple(multiple if j == alone else broadest for j in range(dimensions))
-        for multiple in reversed(narrower)
-        for alone in rng.permutation(dimensions)
-    ]
-    return set(rows[:most])
+    which = [(multiple, alone) for multiple in reversed(narrower) for alone in rng.permutation(dimensions)]
+    return {tuple(multiple if j == alone else broadest for j in range(dimensions)) for multiple, alone in which[:most]}
 
 
 def rescaled(features: StateFeatures, multiples: ArrayLike) -> StateFeatures:
