@@ -23,7 +23,7 @@ from bayespbrl.improvement.check import Check, checked, clearly_better
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
-from bayespbrl.models.blas import one_blas_thread
+from bayespbrl.models.threads import one_blas_thread
 from bayespbrl.policies import Sampler, greedy
 from bayespbrl.preferences import opponent_now, opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation

@@ -345,6 +345,21 @@ def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, cons
         np.testing.assert_allclose(total, expected, rtol=1e-9, atol=1e-11)
 
 
+def test_values_and_sums_are_the_same_to_the_last_bit_in_any_number_of_threads(monkeypatch):
+    rng = np.random.default_rng(6)
+    features = RadialBasis(rng.normal(size=(50, 2)), np.ones(2), np.full(2, np.inf), True, 0.1)
+    multiples = settings(features, inferred=True, rng=rng)
+    paths = [Trajectory(rng.normal(size=(n, 2)), np.zeros((n - 1, 1)), np.zeros(n - 1), False) for n in (2, 300, 700)]
+    weights = [rng.normal(size=(51, 2)) for _ in multiples]
+    found = []
+    for threads in (1, 3):
+        monkeypatch.setattr("bayespbrl.models.threads.most_threads", lambda threads=threads: threads)
+        values = values_under(features, multiples, paths[2].states, weights)
+        found.append([*values, *sums_under(features, multiples, paths, discount=0.9)])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize(("dimensions", "alone"), [(8, 16), (12, 24), (17, 24), (40, 24)])
 def test_in_many_dimensions_the_settings_of_the_prior_are_as_many_and_let_one_matter_alone(dimensions, alone):
     features = RadialBasis(np.zeros((3, dimensions)), np.ones(dimensions), np.full(dimensions, np.inf))

@@ -20,7 +20,7 @@ from bayespbrl.envs.gridworld import REWARDS
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.improvement.update import NEARLY
 from bayespbrl.models import restored, stored
-from bayespbrl.models.blas import one_blas_thread
+from bayespbrl.models.threads import one_blas_thread
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
 

@@ -16,7 +16,7 @@ plain_chain              the paper's sampler: a chain of fixed length
 posterior                draws until the chains have converged; posterior_tree has them in ArviZ's schema
 convergence              R̂, effective sample size and Monte Carlo error
 linear_program           eq. 10, the alternative to the posterior
-blas                     one thread of linear algebra while a run computes
+threads                  one thread of linear algebra while a run computes; independent parts in several
 """
 
 from bayespbrl.models.elliptical_slice_kernel import EllipticalSlice

@@ -1,7 +1,6 @@
 """Chains over all unknowns: Gibbs moves and elliptical slices, by one compiled sampler per capacity."""
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -39,6 +38,7 @@ from bayespbrl.models.preference_problem import (
 from bayespbrl.models.priors import Grid, given
 from bayespbrl.models.split_dynamics import split_move
 from bayespbrl.models.step_moves import Steps, step_moves, steps_of
+from bayespbrl.models.threads import in_threads
 
 # Share of each answer's Gaussian factor that enters the reference: with all of it the reference is as narrow as the
 # posterior's bulk and its residual has no bound in the tails; with none of it the reference is the prior, which mixes
@@ -334,6 +334,6 @@ def flight_chunk(
             return drawn
 
     numbers = range(len(unknowns.setting))
-    with ThreadPoolExecutor(len(numbers) if at_once else 1) as pool:
-        chains: Chunk = jax.tree.map(lambda *each: jnp.stack(each), *pool.map(one, numbers))
+    drawn = in_threads(one, numbers) if at_once else [one(number) for number in numbers]
+    chains: Chunk = jax.tree.map(lambda *each: jnp.stack(each), *drawn)
     return chains

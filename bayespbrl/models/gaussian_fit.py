@@ -8,11 +8,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
-from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
 from bayespbrl.models.likelihoods import Likelihood, WithLapses, has_steps, prob, ties_of
 from bayespbrl.models.low_rank import LowRank, low_rank, used_rows
 from bayespbrl.models.preference_model import PreferenceModel
+from bayespbrl.models.threads import one_blas_thread
 
 NOW_AND_THEN = 0.05  # lapse rate of the Gaussian where answers without lapses contradict each other
 

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
-from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.elliptical_slice import Ellipse
@@ -29,6 +28,7 @@ from bayespbrl.models.likelihoods import log_prob
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, PreferenceModel
 from bayespbrl.models.preference_problem import PreferenceProblem, low_rank_model, prior_ellipse
+from bayespbrl.models.threads import one_blas_thread
 
 LEAST = 16  # draws: half of them are kept, and R̂ needs twice four
 # Decision: this many draws of the second half are kept, evenly spaced; the moves between them are not stored.

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
-from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.chains import CHUNK, LEAST_LAPSES, Chains
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.evidence import log_evidence
@@ -18,6 +17,7 @@ from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, refitted
 from bayespbrl.models.likelihoods import has_steps, ties_of
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
+from bayespbrl.models.threads import one_blas_thread
 
 # A setting that fewer draws have is not diagnosed: how many do is known too badly, and matters little.
 LEAST_SHARE = 0.05

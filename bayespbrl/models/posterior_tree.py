@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from xarray.core import indexing
 
 from bayespbrl import checks
-from bayespbrl.models.blas import one_blas_thread
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import Convergence
 from bayespbrl.models.gaussian_fit import GaussianFit
@@ -18,6 +17,7 @@ from bayespbrl.models.likelihoods import ties_of
 from bayespbrl.models.low_rank import LowRank, UtilityWeights, low_rank, used_rows
 from bayespbrl.models.preference_model import Answers
 from bayespbrl.models.priors import SIDE_BIAS_SCALE
+from bayespbrl.models.threads import one_blas_thread
 
 SAMPLE = ("chain", "draw")
 SAME_MARGINS = 1e-6  # relative to the largest: rounding on one machine, in another's coordinates the error is near 1

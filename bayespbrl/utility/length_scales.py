@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from bayespbrl.features import DiffusionBasis, RadialBasis, StateFeatures, linear
+from bayespbrl.models.threads import in_threads, one_blas_thread
 from bayespbrl.trajectories import Trajectory, trajectory_features
 
 # The prior: a uniform distribution over settings of these multiples of the bandwidths as given; up to three dimensions,
@@ -55,6 +56,7 @@ def rescaled(features: StateFeatures, multiples: ArrayLike) -> StateFeatures:
     return features.rescaled(multiples) if isinstance(features, RadialBasis | DiffusionBasis) else features
 
 
+@one_blas_thread()
 def values_under(
     features: StateFeatures,
     multiples: Float[np.ndarray, "c s"],
@@ -67,15 +69,19 @@ def values_under(
             linear(rescaled(features, row)(states), columns) for row, columns in zip(multiples, weights, strict=True)
         ]
     values = [np.empty((len(states), columns.shape[1])) for columns in weights]
-    for start in range(0, len(states), ROWS_AT_A_TIME):
+
+    def fill(start: int) -> None:
         rows = slice(start, start + ROWS_AT_A_TIME)
         for number, (kernel, shares) in enumerate(features.under(multiples, states[rows])):
             values[number][rows] = shares[:, None] * (kernel @ weights[number][: kernel.shape[1]])
             if features.constant:
                 values[number][rows] += features.constant * weights[number][-1]
+
+    in_threads(fill, range(0, len(states), ROWS_AT_A_TIME))
     return values
 
 
+@one_blas_thread()
 def sums_under(
     features: StateFeatures,
     multiples: Float[np.ndarray, "c s"],
@@ -88,11 +94,15 @@ def sums_under(
         return [trajectory_features(trajectories, rescaled(features, row), discount=discount) for row in multiples]
     functions = len(features.centres)
     sums = np.zeros((len(multiples), len(trajectories), functions + bool(features.constant)))
-    for i, trajectory in enumerate(trajectories):
+
+    def add(i: int) -> None:
+        trajectory = trajectories[i]
         discounts = discount ** np.arange(len(trajectory))
         sums[:, i, functions:] = features.constant * discounts.sum()  # eq. 1
         for start in range(0, len(trajectory), ROWS_AT_A_TIME):
             rows = slice(start, start + ROWS_AT_A_TIME)
             for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):
                 sums[number, i, :functions] += (discounts[rows] * shares) @ kernel  # eq. 1
+
+    in_threads(add, range(len(trajectories)))
     return list(sums)

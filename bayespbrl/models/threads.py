@@ -1,11 +1,18 @@
-"""Number of threads of the linear algebra."""
+"""Threads: one for the linear algebra, and several for independent parts of a computation."""
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from threading import Lock
+from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+VARIABLE = "OMP_NUM_THREADS"  # the processes of a study set it to 1
 
 
 class _Limit:
@@ -46,3 +53,20 @@ def one_blas_thread() -> Iterator[None]:
         yield
     finally:
         limit.leave()
+
+
+def most_threads() -> int:
+    """The number of threads of a computation: one for each core that this process may use, or fewer if so set."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    given = os.environ.get(VARIABLE, "")
+    return min(cores, int(given)) if given.isdecimal() and int(given) else cores
+
+
+def in_threads(function: Callable[[Part], Result], parts: Iterable[Part]) -> list[Result]:
+    """`function` of each part, in their order; the same on any number of cores. An error of one part is raised."""
+    parts = list(parts)
+    threads = min(most_threads(), len(parts))
+    if threads <= 1:
+        return [function(part) for part in parts]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, parts))
