@@ -1,11 +1,15 @@
-"""Effective draws a second of our posterior and of numpyro's NUTS on the same model, against K and D.
+"""Effective draws a second of our posterior and of numpyro's NUTS on the same model, against K and D; or ours alone.
 
-    python benchmarks/many_answers.py --seed 3100 --out benchmarks/results/many-answers-nuts.csv
+    python benchmarks/many_answers.py --seed 3104 --out benchmarks/results/many-answers-nuts.csv
+    python benchmarks/many_answers.py --alone --answers 300 1000 --features 20 0 --tosses 0 0.2 --out FILE.csv
 
 Logistic answers (steepness 5, prior scale 1) to pairs of a thousand items with Gaussian features. Both samplers run in
 one process, first with compilation and then without; a figure is the smallest effective sample size of all margins over
 the seconds of everything, warm-up and diagnosis included. Sizes that are padded to the same share what is compiled of
 ours, so that only the first of them compiles. Prints and writes a table, one line for each K and D.
+
+With `--alone`, the seconds until our posterior converges, of a likelihood that NUTS cannot follow: eq. 8, steepness and
+lapse rate inferred, a share `--tosses` of the answers given at random. D = 0 stands for one-hot features of the items.
 """
 
 import argparse
@@ -23,6 +27,7 @@ from numpyro.infer import MCMC, NUTS
 from bayespbrl.models import preference_model, sample_posterior
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.likelihoods import Logistic
+from bayespbrl.utility.comparisons import normalised
 
 STEEPNESS, ITEMS, CHAINS = 5.0, 1000, 4
 
@@ -36,6 +41,17 @@ def answers(number: int, dimension: int, *, seed: int) -> np.ndarray:
     differences /= np.sqrt(2 * dimension)
     right = rng.random(number) < 1 / (1 + np.exp(-STEEPNESS * differences @ weights))
     return differences * np.where(right, 1, -1)[:, None]
+
+
+def tossed_answers(number: int, dimension: int, tosses: float, *, seed: int) -> np.ndarray:
+    """As `answers`, but wrong by coin tosses alone, and the differences as the learner makes them; D = 0: one-hot."""
+    rng = np.random.default_rng([seed, number, dimension])
+    items = rng.normal(size=(ITEMS, dimension)) if dimension else np.eye(ITEMS)
+    first = rng.integers(0, ITEMS, number)
+    differences, _ = normalised(items[first] - items[(first + rng.integers(1, ITEMS, number)) % ITEMS])
+    margins = differences @ rng.normal(size=items.shape[1])
+    right = np.where(rng.random(number) < tosses, rng.random(number) < 0.5, True)
+    return differences * np.where(right, np.sign(margins), -np.sign(margins))[:, None]
 
 
 def ours(differences: np.ndarray, seed: int) -> np.ndarray:
@@ -96,19 +112,42 @@ def row(number: int, dimension: int, *, seed: int, draws: int) -> dict[str, Any]
     return line
 
 
+def row_alone(number: int, dimension: int, tosses: float, *, seed: int) -> dict[str, Any]:
+    """The line of one K, D and share of tosses: until all that is inferred has converged, in two runs."""
+    differences = tossed_answers(number, dimension, tosses, seed=seed)
+    line: dict[str, Any] = {"seed": seed, "answers": number, "features": dimension or "one-hot", "tosses": tosses}
+    for run, name in enumerate(("compiling", "compiled")):
+        begin, cpu = time.perf_counter(), time.process_time()
+        tree = sample_posterior(differences, num_chains=CHAINS, seed=seed + run)
+        line |= {
+            f"seconds_{name}": float(f"{time.perf_counter() - begin:.4g}"),
+            f"cpu_seconds_{name}": float(f"{time.process_time() - cpu:.4g}"),
+            f"converged_{name}": int(tree.attrs["converged"]),
+            f"rhat_{name}": float(f"{tree.attrs['rhat_max']:.4g}"),
+            f"effective_{name}": float(f"{tree.attrs['effective_sample_size_min']:.4g}"),
+            f"draws_{name}": tree["posterior"].sizes["draw"],
+        }
+    return line
+
+
 def main() -> None:
     """Print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--answers", type=int, nargs="+", default=[30, 300, 3000])
     parser.add_argument("--features", type=int, nargs="+", default=[5, 20, 100])
     parser.add_argument("--draws", type=int, default=500, help="of NUTS, a chain")
+    parser.add_argument("--alone", action="store_true", help="ours, until it converges")
+    parser.add_argument("--tosses", type=float, nargs="+", default=[0.0], help="shares, with --alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="CSV file")
     options = parser.parse_args()
     with options.out.open("w", newline="") as file:
         writer = None
-        for number, dimension in itertools.product(options.answers, options.features):
-            line = row(number, dimension, seed=options.seed, draws=options.draws)
+        for number, dimension, tosses in itertools.product(options.answers, options.features, options.tosses):
+            if options.alone:
+                line = row_alone(number, dimension, tosses, seed=options.seed)
+            else:
+                line = row(number, dimension, seed=options.seed, draws=options.draws)
             if writer is None:
                 writer = csv.DictWriter(file, list(line), lineterminator="\n")
                 writer.writeheader()

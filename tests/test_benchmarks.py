@@ -108,6 +108,23 @@ def test_the_posterior_of_many_answers_is_timed_beside_that_of_nuts(tmp_path, pr
     assert np.all(np.abs(of_both[0].mean((0, 1)) - of_both[1].mean((0, 1))) < 4 * error)
 
 
+@pytest.mark.slow
+def test_the_posterior_of_answers_with_coin_tosses_is_timed_until_it_converges(tmp_path, printed):
+    options = ["--alone", "--answers", 8, "--features", 0, "--tosses", 0, 0.5]
+    printed("many_answers", *options, "--out", tmp_path / "table.csv")
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert table["tosses"].tolist() == [0.0, 0.5]
+    assert (table["features"] == "one-hot").all()
+    assert table["converged_compiled"].all()
+    assert (table["effective_compiled"] >= 400).all()
+    module = benchmark("many_answers")
+    right, tossed = (module.tossed_answers(400, 5, tosses, seed=1) for tosses in (0.0, 0.5))
+    np.testing.assert_allclose(np.mean(np.sum(right**2, axis=1)), 1.0)
+    same = np.all(right == tossed, axis=1)
+    assert np.all(right[~same] == -tossed[~same])
+    assert 0.65 < same.mean() < 0.85  # half of the answers are tossed, and half of those come out right
+
+
 def test_the_index_of_the_results_names_every_file_once_and_nothing_else():
     results = BENCHMARKS / "results"
     named = re.findall(r"^\| \[([^\]]+)\]\(\1\) \|", (results / "README.md").read_text(), flags=re.MULTILINE)
