@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from bayespbrl.models import PreferenceModel, fit_gaussian, priors, sample_posterior, step_moves
-from bayespbrl.models.chains import Chains, flight_draw
+from bayespbrl.models.chains import FEW, Chains, flight_draw
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.elliptical_slice import elliptical_moves, independent_move
 from bayespbrl.models.gaussian_fit import refitted
 from bayespbrl.models.likelihoods import likelihood_of, prob
 from bayespbrl.models.preference_problem import axis_ellipse, padded_problem, reference_ellipse
-from bayespbrl.models.priors import FEW
 from bayespbrl.models.split_dynamics import split_move
 
 GRID = np.linspace(-4.5, 4.5, 91)
@@ -38,7 +37,7 @@ def quadrature(rows, name):
     total, sums = 0.0, np.zeros(4)
     top = -0.5 * len(rows)
     for steepness, p in zip(*priors.STEEPNESS, strict=True):
-        for lapse_rate, q in zip(*PreferenceModel(lapse_rate=None).lapse_rates(len(rows)), strict=True):
+        for lapse_rate, q in zip(*priors.LAPSE_RATE, strict=True):
             mass = p * q * np.exp(log_density(rows, name, steepness, lapse_rate) - top)
             total += mass.sum()
             others = np.array([np.log(steepness), lapse_rate])

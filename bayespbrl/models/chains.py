@@ -15,6 +15,7 @@ from bayespbrl.models.elliptical_slice import Ellipse, independent_move
 from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords, SiteValues
 from bayespbrl.models.gaussian_fit import GaussianFit
 from bayespbrl.models.gibbs import (
+    FEW,
     JointProblem,
     Table,
     Unknowns,
@@ -34,7 +35,7 @@ from bayespbrl.models.preference_problem import (
     prior_ellipse,
     reference_ellipse,
 )
-from bayespbrl.models.priors import FEW, Grid, given
+from bayespbrl.models.priors import Grid, given
 from bayespbrl.models.split_dynamics import split_move
 from bayespbrl.models.step_moves import Steps, step_moves, steps_of
 from bayespbrl.models.threads import in_threads
@@ -199,7 +200,7 @@ def joint_problem(fits: Sequence[GaussianFit], by_answerer: Float[np.ndarray, "a
         stacked(problems),
         jax.device_put(np.full(len(fits), -np.log(len(fits)))),
         table(model.steepness_prior),
-        table(model.lapse_rates(number)),
+        table(model.lapse_rate_prior),
         table(model.tie_threshold_prior if ties_of(likelihood) is not None else given(0.0)),
         jax.device_put(one_hot),
         model.steepness_prior.mean if scaled else None,

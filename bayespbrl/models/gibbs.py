@@ -29,8 +29,9 @@ from bayespbrl.models.likelihoods import (
     log_prob,
 )
 from bayespbrl.models.preference_problem import PreferenceProblem
-from bayespbrl.models.priors import FEW
 
+# Up to this many answers, padding included, the sampler makes more moves of other kinds.
+FEW = 64
 STACKED = ("loadings", "used", "centre", "site_precisions", "root", "inverse_root")
 
 

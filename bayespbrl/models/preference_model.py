@@ -55,10 +55,6 @@ class PreferenceModel:
         """The prior of each answerer's λ."""
         return priors.LAPSE_RATE if self.lapse_rate is None else priors.given(self.lapse_rate)
 
-    def lapse_rates(self, number: int) -> Grid:
-        """The same on the grid for `number` answers."""
-        return priors.LAPSE_RATE_OF_MANY if self.lapse_rate is None and number > priors.FEW else self.lapse_rate_prior
-
     @property
     def tie_threshold_prior(self) -> Grid:
         """The prior of δ, where there is a threshold."""
@@ -228,7 +224,7 @@ def joint_preference_model(
     setting = numpyro.sample("setting", dist.Categorical(jnp.full(len(settings), 1 / len(settings))))
     steepness = one_of("steepness", model.steepness_prior)
     with numpyro.plate("answerer", len(by_answerer)):
-        lapse_rates = one_of("lapse_rate", model.lapse_rates(settings.shape[1]))
+        lapse_rates = one_of("lapse_rate", model.lapse_rate_prior)
     ties = answers.indifferent is not None or model.tie_threshold is not None
     likelihood = likelihood_of(
         model.likelihood,

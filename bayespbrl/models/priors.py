@@ -42,19 +42,6 @@ STEEPNESS = _even(_medians(stats.lognorm(s=1.0, scale=5.0), 9))
 # λ: half of all answerers are attentive; of the others it is Beta(1, 3), mean a quarter, and above a half in 13 %.
 _LAPSES = _medians(stats.beta(1, 3), 12)
 LAPSE_RATE = Grid(np.concatenate([[0.0], _LAPSES]), np.concatenate([[0.5], np.full(12, 0.5 / 12)]))
-# Up to this many answers the grid of λ suffices; more tell 0 from its next value so well that chains hardly cross.
-FEW = 64
-
-
-def _finer(halvings: int) -> Grid:
-    """The same prior of λ with the lowest cell cut in half again and again, towards 0."""
-    edges = np.append(0.0, 0.5 ** np.arange(halvings, -1, -1)) / 12
-    lowest = np.asarray(stats.beta(1, 3).ppf((edges[:-1] + edges[1:]) / 2))
-    probabilities = np.concatenate([[0.5], 0.5 * np.diff(edges), LAPSE_RATE.probabilities[2:]])
-    return Grid(np.concatenate([[0.0], lowest, _LAPSES[1:]]), probabilities)
-
-
-LAPSE_RATE_OF_MANY = _finer(5)  # the lowest is 0.0004: less than one lapse in 1000 answers
 # δ: a tenth of a standard deviation of the margins, give or take a factor of e². Some people call what differs by a
 # third of it equal, others only what is exactly equal: an expert who computes returns.
 TIE_THRESHOLD = _even(_medians(stats.lognorm(s=2.0, scale=0.1), 12))
