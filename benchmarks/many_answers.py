@@ -118,7 +118,7 @@ def row_alone(number: int, dimension: int, tosses: float, *, seed: int) -> dict[
     line: dict[str, Any] = {"seed": seed, "answers": number, "features": dimension or "one-hot", "tosses": tosses}
     for run, name in enumerate(("compiling", "compiled")):
         begin, cpu = time.perf_counter(), time.process_time()
-        tree = sample_posterior(differences, num_chains=CHAINS, seed=seed + run)
+        tree = sample_posterior(differences, steepness=None, lapse_rate=None, num_chains=CHAINS, seed=seed + run)
         line |= {
             f"seconds_{name}": float(f"{time.perf_counter() - begin:.4g}"),
             f"cpu_seconds_{name}": float(f"{time.process_time() - cpu:.4g}"),
