@@ -126,7 +126,7 @@ def test_four_quarters_have_three_divisions_into_halves_which_add_up_to_the_whol
     assert q_function.halvings(["a"]) == []
 
 
-def test_the_halves_are_q_from_half_of_the_transitions_and_the_whole_stays_as_it_was():
+def test_the_halves_are_q_from_half_of_the_transitions_and_the_whole_stays_as_it_was(monkeypatch):
     steps, utilities = random_steps(terminated=True)
     quarters = np.arange(len(steps)) // 7 % 4
     features = StateActionProduct(OneHot(STATES), ACTIONS)
@@ -146,6 +146,9 @@ def test_the_halves_are_q_from_half_of_the_transitions_and_the_whole_stays_as_it
             rows = Transitions(*(column[chosen] for column in vars(steps).values()))
             alone = estimated(rows, utilities[chosen])(states, actions)
             np.testing.assert_allclose(halves[:, side, number], alone, atol=1e-6)
+    monkeypatch.setattr(q_function, "ROWS_AT_A_TIME", 5)  # of 18 pairs, so that the last block is shorter
+    for at_once, in_blocks in zip((whole, halves), q.with_halves(states, actions), strict=True):
+        np.testing.assert_allclose(in_blocks, at_once, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("noise", "expected"), [(0.0, (0.7, 1.0)), (100.0, (0.0, 0.5))])

@@ -66,9 +66,14 @@ class QFunction:
         self, states: Shaped[np.ndarray, "n ..."], actions: Shaped[np.ndarray, "n ..."]
     ) -> tuple[Float[np.ndarray, "n *u"], Float[np.ndarray, "n 2 m"] | None]:
         """Q of N pairs, and that of the halves."""
-        table = _with_bias(self.features(states, actions))
-        halves = None if self.halves is None else np.tensordot(table, self.halves, axes=1)
-        return table @ self.weights, halves  # Q = φᵀθ (paper, step 2)
+        values = np.empty((len(states), *self.weights.shape[1:]))
+        halves = None if self.halves is None else np.empty((len(states), *self.halves.shape[1:]))
+        for rows in _blocks(len(states)):
+            table = _with_bias(self.features(states[rows], actions[rows]))
+            values[rows] = table @ self.weights  # Q = φᵀθ (paper, step 2)
+            if halves is not None:
+                halves[rows] = np.tensordot(table, cast(np.ndarray, self.halves), axes=1)
+        return values, halves
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +156,12 @@ def _sums(
         repeats = np.sqrt(counts[rows])[:, None]  # a row times √n enters every Gram matrix as n rows
         return transition_sums(current * repeats, successor * repeats, (utilities[rows].T * repeats[:, 0]).T)
 
-    # a block at a time: the features of all transitions would fill the memory of a long run
-    blocks = [slice(start, start + ROWS_AT_A_TIME) for start in range(0, len(chosen), ROWS_AT_A_TIME)]
-    return reduce(add, map(sums, blocks))
+    return reduce(add, map(sums, _blocks(len(chosen))))
+
+
+def _blocks(rows: int) -> list[slice]:
+    """Some rows at a time: the features of all of a long run, or of many states and actions, would fill the memory."""
+    return [slice(start, start + ROWS_AT_A_TIME) for start in range(0, rows, ROWS_AT_A_TIME)]
 
 
 def _counted(
