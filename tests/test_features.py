@@ -347,10 +347,10 @@ def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, cons
 
 def test_values_and_sums_are_the_same_to_the_last_bit_in_any_number_of_threads(monkeypatch):
     rng = np.random.default_rng(6)
-    features = RadialBasis(rng.normal(size=(50, 2)), np.ones(2), np.full(2, np.inf), True, 0.1)
+    features = RadialBasis(rng.normal(size=(100, 2)), np.ones(2), np.full(2, np.inf), True, 0.1)
     multiples = settings(features, inferred=True, rng=rng)
     paths = [Trajectory(rng.normal(size=(n, 2)), np.zeros((n - 1, 1)), np.zeros(n - 1), False) for n in (2, 300, 700)]
-    weights = [rng.normal(size=(51, 2)) for _ in multiples]
+    weights = [rng.normal(size=(101, 2)) for _ in multiples]
     found = []
     for threads in (1, 3):
         monkeypatch.setattr("bayespbrl.models.threads.most_threads", lambda threads=threads: threads)

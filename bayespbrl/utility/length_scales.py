@@ -6,7 +6,7 @@ Volinsky 1999).
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,8 @@ from bayespbrl.trajectories import Trajectory, trajectory_features
 # over all of them. Functions hardly change along a dimension with the last.
 MULTIPLES = (1.0, 3.0, 9.0)
 ROWS_AT_A_TIME = 256  # keeps the factors of all settings in the processor's cache
+# Entries of a kernel matrix from which threads pay: with smaller ones they wait for each other in the interpreter.
+WORTH_A_THREAD = 20_000
 MOST_SETTINGS = 27
 MANY = 6  # dimensions; beyond, the prior has settings in which one alone matters
 
@@ -77,7 +79,7 @@ def values_under(
             if features.constant:
                 values[number][rows] += features.constant * weights[number][-1]
 
-    in_threads(fill, range(0, len(states), ROWS_AT_A_TIME))
+    _for_each(fill, range(0, len(states), ROWS_AT_A_TIME), rows=len(states), functions=len(features.centres))
     return values
 
 
@@ -104,5 +106,15 @@ def sums_under(
             for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):
                 sums[number, i, :functions] += (discounts[rows] * shares) @ kernel  # eq. 1
 
-    in_threads(add, range(len(trajectories)))
+    rows = sum(map(len, trajectories)) // max(len(trajectories), 1)
+    _for_each(add, range(len(trajectories)), rows=rows, functions=functions)
     return list(sums)
+
+
+def _for_each(function: Callable[[int], None], parts: Sequence[int], *, rows: int, functions: int) -> None:
+    """Call a function of each part, in threads where the kernel matrices of so many rows are large enough."""
+    if min(rows, ROWS_AT_A_TIME) * functions >= WORTH_A_THREAD:
+        in_threads(function, parts)
+    else:
+        for part in parts:
+            function(part)
