@@ -194,7 +194,7 @@ class Cycle:
         shown = {"first": query.first, "second": query.second, "newcomer": newcomer}
         event = {"event": "asked", "query": number, **shown, **who}
         if options.same_start:
-            tied = preferences.undominated if answerer is None else preferences.tied_with(incumbent)
+            tied = preferences.tied_with(incumbent)
             event["rivals"] = [each for each in rivals(query, state.trajectories, preferences) if each in tied]
         return _entry(event)
 

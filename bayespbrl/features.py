@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
+import scipy.sparse
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete
 from jaxtyping import Float, Int, Shaped
@@ -321,7 +322,8 @@ def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."
     name = getattr(features, "__name__", type(features).__name__)
     if not callable(features):
         raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
-    values = np.asarray(features(np.array(states)))  # a copy, which the function may change
+    values = features(np.array(states))  # a copy, which the function may change
+    values = np.asarray(values.toarray() if scipy.sparse.issparse(values) else values)
     if values.ndim != 2 or len(values) != len(states) or values.shape[1] == 0:
         raise ValueError(f"features {name}: expected shape ({len(states)}, D), got {values.shape}")
     if not (np.issubdtype(values.dtype, np.number) or values.dtype == bool) or np.iscomplexobj(values):
@@ -346,5 +348,5 @@ def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "n ..
 
 def _box(name: str, space: Space[Any]) -> Box:
     if not isinstance(space, Box) or len(space.shape) != 1:
-        raise ValueError(f"{name}: expected a Discrete space or a Box of shape (n,), got {space}")
+        raise ValueError(f"{name}: expected a Box of shape (n,), got {space}")
     return space

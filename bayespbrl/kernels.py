@@ -19,6 +19,7 @@ from bayespbrl import checks
 Vector = Float[Array, " s"] | Float[np.ndarray, " s"]
 Rows = Float[Array, "d s"] | Float[np.ndarray, "d s"]
 SMALLEST_SUM = 1e-200  # of a row of products of exponentials: below it they have lost digits
+FAR = 1e6  # bandwidths from the middle beyond which the expansion of the square loses more than 1e-3
 ROWS_AT_A_TIME = 1024  # keeps a block of a wide kernel matrix in the processor's cache between its three passes
 
 
@@ -57,9 +58,14 @@ def squared_exponential(
     left = np.column_stack([points, -0.5 * np.square(points).sum(axis=1), np.ones(len(points))])
     right = np.column_stack([centres, np.ones(len(centres)), -0.5 * np.square(centres).sum(axis=1)]).T
     kernel = np.empty((len(points), len(centres)))
+    far = max(np.abs(points).max(initial=0), np.abs(centres).max(initial=0)) > FAR
     for start in range(0, len(points), ROWS_AT_A_TIME):
         block = kernel[start : start + ROWS_AT_A_TIME]
-        np.matmul(left[start : start + ROWS_AT_A_TIME], right, out=block)
+        if far:
+            apart = points[start : start + ROWS_AT_A_TIME, None, :] - centres
+            block[:] = -0.5 * np.square(apart).sum(axis=2)
+        else:
+            np.matmul(left[start : start + ROWS_AT_A_TIME], right, out=block)
         if normalised:  # the nearest centre's is exp(0), so that the sum is never zero, however far the point
             block -= block.max(axis=1, keepdims=True)
         np.minimum(block, 0.0, out=block)
@@ -185,10 +191,20 @@ def median_bandwidths(
         return np.zeros(points.shape[1])
     first = rng.integers(len(points), size=number_of_pairs)
     second = (first + rng.integers(1, len(points), size=number_of_pairs)) % len(points)  # never the row itself
-    difference = points[first] - points[second]
+    squares = np.square(_wrapped(points[first] - points[second], periods))
+    middle, mean = np.median(squares, axis=0), squares.mean(axis=0)
+    if (equal := mean == 0).any():  # a rare value may be in no pair
+        mean[equal] = _mean_square(points[:, equal], periods[equal])
+    return factor * np.sqrt(np.where(middle > 0, middle, mean))
+
+
+def _wrapped(difference: Float[np.ndarray, "n s"], periods: Float[np.ndarray, " s"]) -> Float[np.ndarray, "n s"]:
+    """Differences, those of periodic dimensions the shorter way round."""
     periodic = np.isfinite(periods)
     some_period = np.where(periodic, periods, 1.0)
-    wrapped = difference - np.where(periodic, some_period * np.round(difference / some_period), 0.0)
-    squares = np.square(wrapped)
-    middle = np.median(squares, axis=0)
-    return factor * np.sqrt(np.where(middle > 0, middle, squares.mean(axis=0)))
+    return difference - np.where(periodic, some_period * np.round(difference / some_period), 0.0)
+
+
+def _mean_square(points: Float[np.ndarray, "n s"], periods: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+    """Mean over all pairs of rows of the squared difference, exactly 0 where constant; around the first row."""
+    return 2 * _wrapped(points - points[0], periods).var(axis=0, ddof=1)

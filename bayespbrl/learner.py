@@ -146,7 +146,8 @@ class Learner:
     def worth_asking(self) -> float | None:
         """What the answer to the best question of the last iteration was expected to tell, in [0, 1] bits.
 
-        Near zero, more answers would change little. None before the first estimate, and without a posterior.
+        Near zero, more answers would change little. An answer of "no difference" is left out of account. None before
+        the first estimate, without a posterior, and after an iteration that had no answer left to ask for.
         """
         return None if self.state.information is None else self.state.information / np.log(2)
 
@@ -232,13 +233,13 @@ class Learner:
                 self.record(entry)
 
     def undo(self, *, answerer: str | None = None) -> None:
-        """Take the last answer back, and what followed from it; its question waits again.
+        """Take the last answer back, whoever gave it, and what followed from it; its question waits again.
 
         Args:
           answerer: who takes it back, which is kept.
 
         Raises:
-          ValueError: nothing has been answered yet, or a bad name.
+          ValueError: nothing has been answered yet, the last 50 answers were taken back already, or a bad name.
         """
         self.record(events.undone(answerer))
 
@@ -252,7 +253,8 @@ class Learner:
         """Answer all questions by `expert` until the run ends.
 
         Args:
-          expert: called with the two trajectories in the order shown.
+          expert: called with the two trajectories in the order shown. Where it returns an undo, the last answer is
+            taken back if it is the same person's.
           answerer: the name of a person who answers; how long each answer took is then kept too. A repeated question
             that waits for another person is left open.
           progress: called after each iteration, those that ask nothing among them.
@@ -265,7 +267,8 @@ class Learner:
             began = time.perf_counter()
             answer = parse_answer(expert(*query.trajectories))
             seconds = None if answerer is None else time.perf_counter() - began
-            vain = vain + 1 if answer is Answer.UNDO and self.state.previous is None else 0
+            theirs = self.state.previous is not None and self.state.past[-1].answerer == answerer
+            vain = vain + 1 if answer is Answer.UNDO and not theirs else 0
             if vain == VAIN_UNDOS:
                 raise ValueError(f"expert: expected an answer, because there is none to take back, got {vain} undos")
             if not vain:  # else the same question again

@@ -217,6 +217,8 @@ def expected_information(
     Returns:
       shape (n,).
 
+    Decision: an answer of "no difference" is left out of account, even where its threshold is inferred.
+
     Source: Houlsby, Huszár, Ghahramani and Lengyel (2011), "Bayesian active learning for classification and preference
     learning", eq. 2.
     """

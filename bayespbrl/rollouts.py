@@ -18,16 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from jax import Array
 from jaxtyping import Bool, Float, Int, Key, Shaped
 
 from bayespbrl.checks import whole
 from bayespbrl.envs import functional
 from bayespbrl.envs.functional import FunctionalEnv
-from bayespbrl.envs.opening import AnyEnvironment, environment_name, layers, open_environment
+from bayespbrl.envs.opening import AnyEnvironment, environment_name, open_environment, plainly_wrapped
 from bayespbrl.envs.stepping import episodes_by_interface, outside_of, step_limit
-from bayespbrl.policies.policy import AnyArray, Sampler
+from bayespbrl.policies.policy import AnyArray, Sampler, is_pytree
 from bayespbrl.trajectories import Trajectory
 
 _PHASE = 2**31 - 1  # no step of an episode has this number
@@ -92,6 +91,7 @@ def rollout(
         reset_keys = keys if starts is None else jax.vmap(jax.random.key)(np.asarray(starts))
         run = _simulate(dynamics, policy, keys, reset_keys, hold, steps=steps)
         observations, actions, rewards, terminated, lengths = (np.asarray(part) for part in run)
+    _check_actions(dynamics, policy, actions, lengths)
     if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
         raise ValueError(_not_finite(env, _first_not_finite(observations, rewards)))
     if (outside := outside_of(dynamics.observation_space, observations)).any():
@@ -147,15 +147,25 @@ def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episode
 
 def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
     """The pure functions; None where a wrapper or subclass, such as a user's, may change the environment."""
-    *wrappers, inner = layers(env)
-    harmless = all(type(layer) in (TimeLimit, OrderEnforcing, PassiveEnvChecker) for layer in wrappers)
-    if not (isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and harmless and _is_pytree(policy)):
+    inner = env.unwrapped
+    pure = isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and plainly_wrapped(env)
+    if not (isinstance(inner, FunctionalEnv) and pure and is_pytree(policy)):
         return None
+    functional.check(inner.dynamics, environment_name(env))
     return inner.dynamics
 
 
-def _is_pytree(policy: Sampler) -> bool:
-    return all(isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int) for leaf in jax.tree.leaves(policy))
+def _check_actions(
+    dynamics: FuncEnv, policy: Sampler, actions: Shaped[np.ndarray, "n t ..."], lengths: Int[np.ndarray, " n"]
+) -> None:
+    """Check the actions that were taken; JAX would take the nearest of a discrete space."""
+    taken = actions[np.arange(actions.shape[1]) < lengths[:, None]]
+    if not np.isfinite(taken).all():
+        raise ValueError(f"policy {type(policy).__name__}: expected finite actions, got NaN or infinity")
+    if (outside := outside_of(dynamics.action_space, taken)).any():
+        raise ValueError(
+            f"policy {type(policy).__name__}: expected actions of {dynamics.action_space}, got {taken[outside][0]}"
+        )
 
 
 def _first_not_finite(observations: Shaped[np.ndarray, "n t1 ..."], rewards: Float[np.ndarray, "n t"]) -> int:
@@ -179,6 +189,7 @@ def _where(step: int) -> str:
 def _start(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Running, Key[Array, ""]]:
     start_key, steps_key = jax.random.split(key)
     state, observation = functional.reset(dynamics, start_key)
+    state = jax.tree.map(jnp.asarray, state)  # a Python number too
     state = _of_later_types(dynamics, start_key, state)
     return (state, _wide(dynamics, observation), jnp.asarray(True)), steps_key
 
@@ -313,7 +324,7 @@ def _by_interface(
     starts: Sequence[int] | None = None,
 ) -> Iterator[Trajectory]:
     policy_key = jax.random.split(key)[1]
-    choose = _act if _is_pytree(policy) else _act_one_by_one
+    choose = _act if is_pytree(policy) else _act_one_by_one
     blocks = -(-steps // hold)  # of an episode: none is shared with the next
 
     def act(first: int, step: int, observations: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, "n ..."]:

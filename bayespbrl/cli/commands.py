@@ -237,7 +237,7 @@ def trials(
             console.print("Stopped. Nothing is lost: repeat the command to continue.")
             raise
         bar.update(task, completed=number)
-    show_trials(study)
+    show_trials(study, options.get("max_steps"))
 
 
 Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://host:8786.")]

@@ -13,7 +13,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
 from bayespbrl.cli.opening import Place, open_in_browser, somebody_looks
-from bayespbrl.envs.opening import environment_attribute, open_environment
+from bayespbrl.envs.opening import open_environment
+from bayespbrl.envs.stepping import of_whole_episodes
 from bayespbrl.experts import Expert, TerminalExpert
 from bayespbrl.figures import new_figure, png
 from bayespbrl.learner import Learner
@@ -52,7 +53,8 @@ def run_to_the_end(
         else:
             _run_with_bar(learner, _simulated(learner, directory))
     except KeyboardInterrupt:
-        console.print(f"\nStopped. Nothing is lost: bayespbrl resume {directory}")
+        again = shlex.join(["bayespbrl", "resume", str(directory), *(f"--answerer={name}" for name in answerers)])
+        console.print(f"\nStopped. Nothing is lost: {again}")
         raise
     show_run(learner, directory)
 
@@ -199,15 +201,15 @@ def _table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     console.print(table)
 
 
-def _positive_optimum(environment: gymnasium.Env) -> float | None:
+def _positive_optimum(environment: gymnasium.Env, max_steps: int | None) -> float | None:
     """The environment's optimal return, where a value is a share of it."""
-    optimum = environment_attribute(environment, "optimal_return")
+    optimum = of_whole_episodes(environment, "optimal_return", max_steps)
     return float(optimum) if optimum is not None and optimum > 0 else None
 
 
 def _print_iterations(learner: Learner) -> None:
     """A row for the first iteration, every fifth and the last, narrow enough for eighty columns."""
-    optimum = _positive_optimum(learner.environment)
+    optimum = _positive_optimum(learner.environment, learner.settings.rollouts.max_steps)
     # the number of answers does not identify an iteration where some ask nothing
     numbered = len({s["answers"] for s in learner.iterations}) < len(learner.iterations)
     rows = [
@@ -230,14 +232,17 @@ def _print_iterations(learner: Learner) -> None:
     _table(f"{settings.env}, {settings.estimation.utility}, seed {settings.seed}", columns, rows)
 
 
-def show_trials(study: Trials) -> None:
-    """Print the results of a study, draw its learning curves beside its tables, and print their paths."""
+def show_trials(study: Trials, max_steps: int | None = None) -> None:
+    """Print the results of a study, draw its learning curves beside its tables, and print their paths.
+
+    `max_steps` is the time limit of its episodes; None: the environment's.
+    """
     from bayespbrl.diagnostics.plots import trials_figure
 
     table, quartiles = study.table, study.quartiles()
     environment = open_environment(table.attrs["env"])
     title = f"{table.attrs['env']}, {table.attrs['utility']}, {table.sizes['seed']} trials"
-    _print_quartiles(quartiles, _positive_optimum(environment), title)
+    _print_quartiles(quartiles, _positive_optimum(environment, max_steps), title)
     if table.attrs["redraws"]:
         seeds = table.attrs["redrawn_seeds"].replace(" ", ", ")
         console.print(f"Trials redrawn because they met no preference: {table.attrs['redraws']}, seeds {seeds}.")
@@ -246,7 +251,7 @@ def show_trials(study: Trials) -> None:
     _print_numerics(table)
     console.print(f"Tables: {study.path / 'trials.csv'}, {study.path / 'trials.nc'}")
     picture = study.path / "trials.png"
-    write_file(picture, png(trials_figure(quartiles, environment, title)))
+    write_file(picture, png(trials_figure(quartiles, environment, title, max_steps)))
     console.print(f"Picture: {picture}")
 
 

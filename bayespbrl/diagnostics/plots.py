@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from bayespbrl.diagnostics.axes import number_cells
 from bayespbrl.diagnostics.estimates import expect_estimate
 from bayespbrl.envs.opening import environment_attribute
+from bayespbrl.envs.stepping import of_whole_episodes
 from bayespbrl.figures import new_figure
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Transitions, transitions
@@ -55,11 +56,16 @@ def quartile_curve(quartiles: xr.Dataset, axes: Axes, *, levels: Mapping[str, fl
     return axes
 
 
-def trials_figure(quartiles: xr.Dataset, environment: gymnasium.Env, title: str) -> Figure:
-    """`quartile_curve` with the environment's published returns and its optimum, where it has them."""
+def trials_figure(
+    quartiles: xr.Dataset, environment: gymnasium.Env, title: str, max_steps: int | None = None
+) -> Figure:
+    """`quartile_curve` with the environment's published returns and its optimum, where it has them.
+
+    `max_steps` is the time limit of the episodes; None: the environment's.
+    """
     figure = new_figure(7, 4.5)
-    levels = dict(environment_attribute(environment, "published_returns") or {})
-    optimum = environment_attribute(environment, "optimal_return")
+    levels = dict(of_whole_episodes(environment, "published_returns", max_steps) or {})
+    optimum = of_whole_episodes(environment, "optimal_return", max_steps)
     axes = quartile_curve(
         quartiles, figure.subplots(), levels=levels | ({} if optimum is None else {"optimal": optimum})
     )
@@ -92,7 +98,9 @@ def run_figure(learner: Learner) -> Figure:
     """The learning curve, and the inferred utility beside the hidden reward, as one figure."""
     figure = new_figure(13, 4)
     curve, utility, reward = figure.subplots(1, 3)
-    learning_curve(learner.iterations, curve, optimum=environment_attribute(learner.environment, "optimal_return"))
+    steps = learner.settings.rollouts.max_steps
+    optimum = of_whole_episodes(learner.environment, "optimal_return", steps)
+    learning_curve(learner.iterations, curve, optimum=optimum)
     utility_beside_reward(learner, utility, reward)
     return figure
 

@@ -5,13 +5,15 @@ compiled rollouts both go through them, so that the two views cannot drift apart
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
+from gymnasium.spaces import Box
 from jax import Array
 from jaxtyping import Key, Shaped, UInt8
 
@@ -48,6 +50,28 @@ def step(dynamics: FuncEnv, key: Key[Array, ""], state: Any, action: Any) -> tup
     observation = dynamics.observation(next_state, observation_key)
     reward = dynamics.reward(state, action, next_state, reward_key)
     return next_state, observation, reward, dynamics.terminal(next_state, terminal_key)
+
+
+@lru_cache(maxsize=64)
+def check(dynamics: FuncEnv, name: str) -> None:
+    """Check that a step can be traced, and gives an observation of the space, one reward and one `terminal`.
+
+    Raises:
+      ValueError: what the functions raise, or a result of another shape.
+    """
+    space, key = dynamics.action_space, jax.random.key(0)
+    try:
+        with jax.enable_x64(True):
+            action = jnp.zeros(space.shape or (), float if isinstance(space, Box) else int)
+            state, first = jax.eval_shape(partial(reset, dynamics), key)
+            _, observation, reward, terminal = jax.eval_shape(partial(step, dynamics), key, state, action)
+    except Exception as error:
+        raise ValueError(f"environment {name} failed: {type(error).__name__}: {error}") from error
+    shape = dynamics.observation_space.shape or ()
+    expected = {"observation": shape, "reward": (), "terminal": ()}
+    for part, got in (("observation", first), ("observation", observation), ("reward", reward), ("terminal", terminal)):
+        if got.shape != expected[part]:
+            raise ValueError(f"environment {name}: {part}: expected shape {expected[part]}, got {got.shape}")
 
 
 # One compilation for all environments over the same dynamics object (hashed by identity).

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box, Discrete, Space, flatten, flatten_space
-from gymnasium.wrappers import TransformAction, TransformObservation
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformAction, TransformObservation
 
 from bayespbrl import checks
 from bayespbrl.envs import SHORT_NAMES
@@ -141,6 +141,12 @@ def observed_otherwise(env: gymnasium.Env) -> bool:
     return wrapped or given.observation_space != inner.observation_space
 
 
+def plainly_wrapped(env: gymnasium.Env) -> bool:
+    """Whether all wrappers are those of `gymnasium.make`, which leave observations, actions and rewards alone."""
+    *wrappers, _ = layers(env)
+    return all(type(layer) in (TimeLimit, OrderEnforcing, PassiveEnvChecker) for layer in wrappers)
+
+
 def layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
     """The environment with its wrappers, the outermost first."""
     while isinstance(env, gymnasium.Wrapper):
@@ -249,6 +255,8 @@ def to_plain(
         _check_number(space, value)
         return np.eye(int(space.n))[int(value - space.start)]
     if isinstance(space, Discrete):
+        if not (np.isfinite(value) and value == int(value)):
+            raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
         return np.int64(value - space.start)
     if isinstance(space, Box):
         return np.reshape(value, -1)

@@ -24,6 +24,7 @@ from bayespbrl.envs.opening import (
     layers,
     made_from,
     open_environment,
+    plainly_wrapped,
 )
 
 MAX_LANES = 128  # copies of an environment stepped side by side
@@ -40,7 +41,8 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
     env = open_environment(environment)
     wrapped = [layer._max_episode_steps for layer in layers(env) if isinstance(layer, TimeLimit)]
     if max_steps is not None:
-        own = [] if made_from(env) is not None or isinstance(env.unwrapped, FunctionalEnv) else wrapped
+        pure = isinstance(env.unwrapped, FunctionalEnv) and plainly_wrapped(env)
+        own = [] if made_from(env) is not None or pure else wrapped
         return min([whole("max_steps", max_steps), *own])
     limits: list[int | None] = [min(wrapped, default=None)]
     limits.append(env.spec.max_episode_steps if env.spec is not None else None)
@@ -49,6 +51,19 @@ def step_limit(environment: AnyEnvironment, max_steps: int | None = None) -> int
         if limit is not None:
             return int(limit)
     raise ValueError(f"max_steps: expected a number, because {environment_name(env)} has no time limit, got None")
+
+
+def of_whole_episodes(env: gymnasium.Env, name: str, max_steps: int | None = None) -> Any:
+    """`optimal_return` or `published_returns` of the environment; None without, and where episodes have another length.
+
+    Args:
+      env: opened.
+      name: of the dynamics' attribute, which is about their own time limit.
+      max_steps: as of `step_limit`.
+    """
+    limit = environment_attribute(env, "max_episode_steps")
+    other = max_steps is not None and limit is not None and step_limit(env, max_steps) != limit
+    return None if other else environment_attribute(env, name)
 
 
 def episodes_by_interface(

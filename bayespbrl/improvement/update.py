@@ -112,7 +112,7 @@ class ProposedUpdate:
             first, second = (advantages(q, self.constraint, self.base_weights) for q in division)
             product = (self.base_weights @ first**2) * (self.base_weights @ second**2)
             correlations.append(self.base_weights @ (first * second) / np.sqrt(product) if product > 0 else 0.0)
-        correlation = max(float(np.mean(correlations)), 0.0)
+        correlation = min(max(float(np.mean(correlations)), 0.0), 1.0)  # rounding may take it above 1
         return 2 * correlation / (1 + correlation)  # Spearman (1910), Brown (1910)
 
     def agreement(self, kl_bound: float | None = None) -> float:

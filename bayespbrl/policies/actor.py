@@ -10,6 +10,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 from jaxtyping import Array, Key
 
+from bayespbrl import checks
 from bayespbrl.policies.batch import sample_actions
 from bayespbrl.policies.greedy import Greedy, greedy
 from bayespbrl.policies.policy import Sampler, is_discrete
@@ -82,6 +83,7 @@ class Actor:
 
     def _rows(self, observations: Any) -> np.ndarray:
         rows = np.array([self.observe(each) for each in observations])
+        checks.finite("observation", rows)
         return rows.astype(np.int64 if rows.ndim == 1 else np.float64)
 
     def _drawn(self, policy: Sampler, observations: Any, key: Key[Array, ""] | None = None) -> list[Any]:

@@ -11,9 +11,10 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
+from bayespbrl.policies.batch import entropies
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
-from bayespbrl.policies.policy import Policy, is_discrete
+from bayespbrl.policies.policy import Policy, is_discrete, is_pytree
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
@@ -65,7 +66,8 @@ def fitting(policy: Policy, observation_space: Space[Any], action_space: Space[A
     """`policy`, tried at one observation.
 
     Raises:
-      ValueError: one that does not take the observations of the one space or does not give the actions of the other.
+      ValueError: one that does not take the observations of the one space, does not give the actions of the other, or
+        lacks what an update needs of it.
     """
     if isinstance(observation_space, Discrete):
         observation = np.asarray(observation_space.n - 1)  # the last: a smaller table has no row for it
@@ -81,6 +83,12 @@ def fitting(policy: Policy, observation_space: Space[Any], action_space: Space[A
             got = np.asarray(policy.probabilities(observation[None])).shape
         else:
             got = np.asarray(policy.sample(jax.random.key(0), observation)).shape
+        if got == expected:  # what the first update needs
+            if not is_pytree(policy):
+                raise ValueError("one that is no JAX pytree of arrays")
+            entropies(policy, observation[None])
+            if not is_discrete(policy):
+                policy.action_standard_deviation(observation[None])
     except Exception as error:
         got = checks.reason(error)
     if got != expected:

@@ -2,6 +2,7 @@
 
 from typing import Any, Protocol, Self, TypeGuard, runtime_checkable
 
+import jax
 import numpy as np
 from gymnasium import Space
 from jax import Array
@@ -106,6 +107,11 @@ def fit_converged(policy: object) -> bool | None:
     """Whether the last fit of a policy succeeded; None where the policy does not know."""
     known = getattr(policy, "converged", None)
     return None if known is None else bool(np.all(known))
+
+
+def is_pytree(policy: object) -> bool:
+    """Whether a policy is a JAX pytree of numbers, so that it can be compiled."""
+    return all(isinstance(leaf, Array | np.ndarray | np.generic | float | int) for leaf in jax.tree.leaves(policy))
 
 
 def is_discrete(policy: object) -> TypeGuard[DiscretePolicy]:

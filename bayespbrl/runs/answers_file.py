@@ -93,8 +93,8 @@ def _row(line: dict[str, str | None], number: int) -> tuple[int, int, Answer, st
         if first == second:
             raise ValueError(f"second: expected another number than first, got {second} twice")
         answer = Answer(checks.one_of("answer", (line["answer"] or "").strip(), GIVEN))
-        name = line.get("answerer") or ""
-        return first, second, answer, checks.short_name("answerer", name.strip() or name) if name else ""
+        name = (line.get("answerer") or "").strip()
+        return first, second, answer, checks.short_name("answerer", name) if name else ""
     except ValueError as error:
         raise ValueError(f"line {number}: {error}") from None
 

@@ -224,7 +224,8 @@ def _check_no_more(seeds: Seeds) -> None:
     """Check that a row has no more finished trials than it is to have: the table would lose them."""
     row = seeds.row
     beyond = row.settings.seed + len(seeds.outcomes)
-    if row.path(beyond).exists() and row.outcome(beyond):
+    kept = (path.name.removeprefix("seed-") for path in row.directory.glob("seed-*"))
+    if any(row.outcome(seed) for seed in (int(each) for each in kept if each.isdecimal()) if seed >= beyond):
         raise ValueError(f"trials: expected more than {seeds.trials}, of which {row.name} has finished more already")
 
 

@@ -41,7 +41,10 @@ class UtilityEstimate(Protocol):
         ...
 
     def thinned(self, number: int) -> Self:
-        """At most `number` of the draws, for `utilities` and `utilities_and_draws` alone; itself without draws."""
+        """At most `number` of the draws, but one of each chain, for `utilities` and `utilities_and_draws` alone.
+
+        Itself without draws.
+        """
         ...
 
     def hyperparameters(self) -> dict[str, Any] | None:

@@ -185,5 +185,5 @@ class PosteriorUtility:
 
 
 def spacing(total: int, number: int | None) -> int:
-    """Distance between at most `number` of `total` draws, evenly spaced; 1 for None, which is all of them."""
+    """Every how manieth draw of each chain leaves at most `number` of `total`, but one of each chain; None: every."""
     return 1 if number is None else -(-total // checks.whole("number", number))

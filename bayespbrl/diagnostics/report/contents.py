@@ -21,6 +21,7 @@ from bayespbrl.diagnostics.predictions import fitted_model
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
 from bayespbrl.envs.opening import check_of_space, environment_attribute, imported_by_name, open_environment
+from bayespbrl.envs.stepping import of_whole_episodes
 from bayespbrl.features import StateFeatures, checked_features
 from bayespbrl.models import PreferenceModel
 from bayespbrl.preferences import PastQuestion, Preferences
@@ -114,8 +115,16 @@ class RunContents:
         """Prior and likelihood of the last fit, or of the settings without one."""
         return self.settings.model if self.posterior is None else fitted_model(self.posterior)
 
+    @property
+    def optimum(self) -> float | None:
+        """The return of an optimal policy, where the environment says so."""
+        if self.environment is None:
+            return None
+        optimum = of_whole_episodes(self.environment, "optimal_return", self.settings.rollouts.max_steps)
+        return None if optimum is None else float(optimum)
+
     def environment_attribute(self, name: str) -> Any:
-        """`optimal_return` and the like of the environment; None where it has none."""
+        """`grid_shape` and the like of the environment; None where it has none."""
         return None if self.environment is None else environment_attribute(self.environment, name)
 
 

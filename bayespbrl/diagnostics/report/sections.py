@@ -40,7 +40,7 @@ def learning_curve(contents: RunContents, iterations: xr.Dataset) -> Body:
     """The learning curve, by the hidden reward and by the inferred utility."""
     if not iterations.sizes["iteration"]:
         return ["No iteration is completed yet."], []
-    optimum = contents.environment_attribute("optimal_return")
+    optimum = contents.optimum
     panels = [("Value against answers", partial(figures.plot_value, iterations, optimum=optimum))]
     caption = (
         "Each point is the value of the policy that the run keeps after an update: the mean return of fresh episodes, "

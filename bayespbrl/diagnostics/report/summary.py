@@ -37,7 +37,7 @@ def _value(contents: RunContents, iterations: xr.Dataset) -> str:
         return f"After {so_far} the value of the policy is unknown for some iterations."
     episodes = count(contents.settings.rollouts.evaluation_episodes, "fresh episode")
     text = f"After {so_far} the policy's value, the mean return of {episodes}, is {number(value[-1])}"
-    optimum = contents.environment_attribute("optimal_return")
+    optimum = contents.optimum
     if optimum is not None and optimum > 0:
         text += f", {percent(value[-1] / optimum, 1)} of the optimum {number(optimum)}"
     elif optimum is not None:
