@@ -82,6 +82,11 @@ def short_name(name: str, value: Any) -> str:
     return str(value)
 
 
+def dense(values: Any) -> np.ndarray:
+    """`values` as an array, of SciPy's sparse ones too."""
+    return np.asarray(values.toarray() if hasattr(values, "toarray") else values)
+
+
 def finite(name: str, values: Any) -> None:
     """Check that an array holds numbers, and neither NaN nor infinity."""
     try:

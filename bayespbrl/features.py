@@ -11,13 +11,12 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
-import scipy.sparse
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete
 from jaxtyping import Float, Int, Shaped
 from numpy.typing import ArrayLike
 
-from bayespbrl.checks import indices, matrix, positive, whole
+from bayespbrl.checks import dense, indices, matrix, positive, whole
 from bayespbrl.kernels import as_periods, median_bandwidths, radial_basis, radial_basis_under
 from bayespbrl.trajectories import Trajectory, Transitions
 
@@ -322,8 +321,7 @@ def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."
     name = getattr(features, "__name__", type(features).__name__)
     if not callable(features):
         raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
-    values = features(np.array(states))  # a copy, which the function may change
-    values = np.asarray(values.toarray() if scipy.sparse.issparse(values) else values)
+    values = dense(features(np.array(states)))  # a copy, which the function may change
     if values.ndim != 2 or len(values) != len(states) or values.shape[1] == 0:
         raise ValueError(f"features {name}: expected shape ({len(states)}, D), got {values.shape}")
     if not (np.issubdtype(values.dtype, np.number) or values.dtype == bool) or np.iscomplexobj(values):

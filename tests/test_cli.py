@@ -184,7 +184,7 @@ def test_a_person_answers_at_the_prompt_stops_and_resumes(monkeypatch, capsys, t
     status = call(monkeypatch, "run", "gridworld", *QUICK, "--expert", "terminal", "--answerer", "Ada", "--out", out)
     shown = capsys.readouterr().out
     assert status == 130
-    assert "resume" in shown
+    assert f"resume {out} --answerer=Ada" in shown.replace("\n", "")
     assert (out / "query.png").read_bytes().startswith(b"\x89PNG")
     answered = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
     answered = [event for event in answered if event["event"] == "answered"]

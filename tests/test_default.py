@@ -50,6 +50,17 @@ def test_the_budget_ends_the_questions_and_the_run_a_little_later(run):
     assert run.settings.iterations is None
 
 
+@pytest.mark.parametrize("seed", [4, 5])
+def test_an_answer_says_nothing_of_trajectories_from_other_starts(seed):
+    options = {"preset": "paper", "utility": "linear-program", "trajectories_per_iteration": 4, "iterations": 14}
+    sizes = {"max_steps": 8, "evaluation_episodes": 1, "centres": 10}
+    run = Learner(Slope(), same_start=True, answers=12, seed=seed, **options, **sizes).run(ReturnExpert())
+    asked = {frozenset((past.first, past.second)) for past in run.state.past}
+    assert {frozenset(pair) for pair in run.preferences.pairs} <= asked
+    returns = [trajectory.total_reward for trajectory in run.trajectories]
+    assert all(returns[better] > returns[worse] for better, worse in run.preferences.pairs)
+
+
 @pytest.mark.parametrize(("seed", "skips"), [(2, False), (5, True)])
 def test_no_two_from_one_start_are_asked_about_twice(seed, skips):
     options = {"answers": 8, "same_start": True, "queries_per_iteration": 3, "worthwhile": False, "iterations": 5}
@@ -220,6 +231,8 @@ def test_a_policy_without_a_mode_is_tried_and_kept_with_its_noise():
     assert isinstance(learner.policy, Plain)
     actor = Actor(learner.policy, Slope.action_space, np.random.default_rng(0), observation_shape=(2,))
     assert actor.act(np.zeros(2)) != actor.act(np.zeros(2))
+    with pytest.raises(ValueError, match="observation: expected finite entries, got NaN or infinity"):
+        actor.act(np.array([0, np.nan]))
     with pytest.raises(
         ValueError, match="deterministic: expected a policy with a method mode or probabilities, got Plain"
     ):

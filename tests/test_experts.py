@@ -227,3 +227,13 @@ def test_a_run_finds_the_expert_that_its_settings_name_in_units_of_its_task():
     expert = expert_of(learner)
     learner.run(expert)
     assert expert_of(learner) == expert  # continued, it is the same
+
+
+def test_thresholds_are_in_units_of_the_clips_that_are_shown():
+    options = {"preset": "paper", "utility": "linear-program", "max_steps": 40, "evaluation_episodes": 2, "seed": 3}
+    widths = [
+        expert_of(bayespbrl.Learner("gridworld", expert="margin", clip_steps=steps, **options)).width
+        for steps in (None, 40, 4)
+    ]
+    assert widths[0] == pytest.approx(widths[1])
+    assert 0 < widths[2] < 0.5 * widths[0]

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.sparse
 from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.features import (
@@ -191,6 +192,34 @@ def test_median_rule_of_a_mostly_constant_dimension_is_not_zero():
     assert median_bandwidths(points, rng=np.random.default_rng(0))[0] == pytest.approx(
         np.sqrt(2 * 0.05 * 0.95), rel=0.2
     )
+
+
+def test_median_rule_finds_a_value_so_rare_that_hardly_a_pair_has_it():
+    points = np.zeros((20_000, 2))
+    points[[7, 9000]] = (1.0, 2 * np.pi - 0.5)
+    exact = np.sqrt(2 * points[:, 0].var(ddof=1)) * np.array([1, 0.5])
+    found = [median_bandwidths(points, period=(np.inf, 2 * np.pi), rng=np.random.default_rng(s)) for s in range(8)]
+    assert np.all(np.array(found) > 0)
+    assert np.any(np.all(np.isclose(found, exact), axis=1))  # no pair had it
+    assert not median_bandwidths(np.full((50, 2), 0.1), rng=np.random.default_rng(0)).any()
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_states_beside_a_few_that_are_very_far_keep_their_features(normalised):
+    rng = np.random.default_rng(7)
+    states = np.column_stack([rng.uniform(0, 10, 300), rng.normal(size=300)])
+    states[::10, 0] = 1e10  # what some sensors give for "nothing"
+    space = Box(-np.inf, np.inf, (2,))
+    features = draw_state_features(space, states, RadialBasisOptions(40, normalised=normalised), rng=rng)
+    scaled, centres = states / features.bandwidths, features.centres / features.bandwidths
+    exact = np.exp(-0.5 * np.square(scaled[:, None] - centres).sum(axis=2))
+    exact /= exact.sum(axis=1, keepdims=True) if normalised else 1
+    np.testing.assert_allclose(features(states), exact, atol=1e-6)
+
+
+def test_sparse_features_of_the_users_are_taken():
+    found = checked_features(lambda states: scipy.sparse.csr_array(np.eye(3)[states]), np.array([2, 0]))
+    np.testing.assert_array_equal(found, np.eye(3)[[2, 0]])
 
 
 def test_centres_are_observed_states_without_repetition():

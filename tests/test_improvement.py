@@ -1,5 +1,6 @@
 """Step 2: on a small discrete problem with a known model, and once with continuous actions."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -159,6 +160,16 @@ def test_reliability_is_near_one_where_transitions_tell_q_and_low_where_they_do_
     proposed = update.propose(random_policy(), problem(steps, noisy, quarters=quarters), key=jax.random.key(1))
     assert expected[0] <= proposed.reliability <= expected[1]
     assert update.propose(random_policy(), problem(steps, noisy), key=jax.random.key(1)).reliability == 1.0
+
+
+def test_halves_that_agree_exactly_are_no_more_than_reliable():
+    steps, utilities = random_steps(terminated=True)
+    proposed = update.propose(random_policy(), problem(steps, utilities), key=jax.random.key(1))
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(40, len(proposed.base_weights)))
+    alike = [replace(proposed, q_halves=np.stack([each, 3 * each], 1)[..., None]).reliability for each in q]
+    assert max(alike) == 1.0  # rounding makes a correlation of 1 + 2e-16
+    np.testing.assert_allclose(alike, 1.0)
 
 
 @pytest.mark.parametrize("continuous", [False, True])

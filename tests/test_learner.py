@@ -363,6 +363,20 @@ def test_undo_as_an_answer_takes_the_previous_one_back_and_asks_it_again():
     assert run.preferences.answers == 0
 
 
+def test_a_person_takes_no_answer_of_another_back():
+    run, given = learner(), []
+
+    def bob(first, second):
+        given.append("undo" if len(given) < 2 else "first")
+        return given[-1]
+
+    run.ask()
+    run.tell(["first"], answerer="Ada")
+    run.run(bob, answerer="Bob")
+    assert given[:3] == ["undo", "undo", "first"]
+    assert [past.answerer for past in run.state.past][:2] == ["Ada", "Bob"]
+
+
 def test_the_last_answers_can_be_undone_and_no_more_are_held_in_memory(monkeypatch):
     monkeypatch.setattr(events.fold, "MOST_UNDONE", 2)
     run = learner(first_queries=5)
@@ -796,6 +810,32 @@ def test_exploration_is_held_for_a_share_of_the_first_episodes_where_they_end_ea
     assert held == [10, 2]
 
 
+class Ordinary:
+    """A policy of five actions that cannot be compiled."""
+
+    def sample(self, key, observation):
+        return 2
+
+    def probabilities(self, observations):
+        return np.full((len(observations), 5), 0.2)
+
+    @classmethod
+    def initial(cls, observation_space, action_space):
+        return cls()
+
+    def log_prob(self, observation, action):
+        return np.log(0.2)
+
+    def entropy(self, observation):
+        return np.log(5)
+
+    def kl_divergence(self, old, observations):
+        return np.zeros(len(observations))
+
+    def fit(self, observations, actions, sample_weights, *, rng, base_weights=None):
+        return self
+
+
 @pytest.mark.parametrize(
     ("env", "policy"),
     [
@@ -805,6 +845,7 @@ def test_exploration_is_held_for_a_share_of_the_first_episodes_where_they_end_ea
         ("swing-up", LinearGaussianPolicy.initial(Box(-1, 1, (3,)), Box(-1, 1, (1,)))),
         ("swing-up", LinearGaussianPolicy.initial(Box(-1, 1, (2,)), Box(-1, 1, (2,)))),
         ("swing-up", TabularPolicy.initial(Discrete(25), Discrete(3))),
+        ("gridworld", Ordinary()),
     ],
 )
 def test_a_policy_that_does_not_suit_the_environment_is_refused(env, policy):

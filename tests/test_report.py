@@ -524,8 +524,8 @@ def test_a_tie_is_said_to_be_used_and_the_asked_pair_is_found_among_those_of_its
 )
 def test_the_value_is_a_share_of_a_positive_optimum_alone(contents, optimum, words):
     class Known:
-        def environment_attribute(self, name):
-            return optimum
+        def __init__(self):
+            self.optimum = optimum
 
         def __getattr__(self, name):
             return getattr(contents, name)

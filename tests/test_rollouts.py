@@ -18,7 +18,7 @@ from bayespbrl import rollouts
 from bayespbrl.envs import functional, opening
 from bayespbrl.envs.gridworld import Gridworld
 from bayespbrl.envs.opening import open_environment
-from bayespbrl.envs.stepping import random_episodes, step_limit
+from bayespbrl.envs.stepping import of_whole_episodes, random_episodes, step_limit
 from bayespbrl.features import checked_features
 from bayespbrl.rollouts import returns, rollout
 from bayespbrl.settings import Task
@@ -253,6 +253,23 @@ def test_of_several_limits_the_least_holds():
         assert len(rollout(env, UNIFORM_TABLE, key=KEY, episodes=1)[0]) == 3
 
 
+def test_the_limit_of_an_object_holds_under_a_users_wrapper():
+    env = gymnasium.wrappers.RescaleAction(gymnasium.make("bayespbrl/SwingUp-v0"), np.float64(-1), np.float64(1))
+    assert step_limit(env, 200) == len(rollout(env, STEER, key=KEY, episodes=1, max_steps=200)[0]) == step_limit(env)
+
+
+@pytest.mark.parametrize(("steps", "optimum"), [(None, 294.8125), (300, 294.8125), (10, None), (600, None)])
+def test_an_optimum_is_of_the_tasks_own_episodes(steps, optimum):
+    assert of_whole_episodes(open_environment("gridworld"), "optimal_return", steps) == optimum
+
+
+@pytest.mark.parametrize("value", [1.5, np.nan])
+def test_no_fraction_passes_for_a_number_of_a_discrete_space(value):
+    assert opening.to_plain(Discrete(5, start=1), 2.0) == 1
+    with pytest.raises(ValueError, match=r"observation: expected one of Discrete\(5, start=1\), got"):
+        opening.to_plain(Discrete(5, start=1), value)
+
+
 def test_users_wrappers_are_not_bypassed():
     env = gymnasium.wrappers.TransformReward(gymnasium.make("bayespbrl/Gridworld-v0"), lambda reward: -reward)
     trajectory = rollout(env, UNIFORM_TABLE, key=KEY, episodes=1, max_steps=20)[0]
@@ -400,6 +417,58 @@ class Corridor(Drifting):
         return state[0].astype(int)
 
 
+class Cell(FromWhole):
+    """Starts at a Python number."""
+
+    observation_space = Discrete(5)
+
+    def initial(self, rng, params=None):
+        return 2
+
+    def transition(self, state, action, rng, params=None):
+        return jnp.clip(state + 1, 0, 4)
+
+    def observation(self, state, rng, params=None):
+        return state
+
+    def reward(self, state, action, next_state, rng, params=None):
+        return next_state * 1.0
+
+    def terminal(self, state, rng, params=None):
+        return state < 0
+
+
+def test_a_state_may_begin_as_a_python_number():
+    dynamics, coin = Cell({"bad": ""}), Coin(np.array(0.5))
+    assert rollout(dynamics, coin, key=KEY, episodes=1, max_steps=3)[0].states.tolist() == [2, 3, 4, 4]
+    assert returns(dynamics, coin, key=KEY, episodes=1, max_steps=3).total.tolist() == [11]
+
+
+class Slip(Drifting):
+    """Returns one reward in an array."""
+
+    def reward(self, state, action, next_state, rng, params=None):
+        return next_state
+
+
+class Broken(Drifting):
+    def transition(self, state, action, rng, params=None):
+        raise RuntimeError("the motor is on fire")
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "message"),
+    [
+        (Slip({"bad": ""}), r"Slip: reward: expected shape \(\), got \(1,\)"),
+        (Broken({"bad": ""}), "Broken failed: RuntimeError: the motor is on fire"),
+    ],
+)
+@pytest.mark.parametrize("run", [rollout, returns])
+def test_pure_functions_that_go_wrong_are_named(run, dynamics, message):
+    with pytest.raises(ValueError, match=message):
+        run(dynamics, Coin(np.array(0.5)), key=KEY, episodes=1, max_steps=3)
+
+
 # The gymnasium interface.
 
 
@@ -511,9 +580,15 @@ def test_a_discrete_observation_outside_its_space_is_named_with_the_step(env, me
         rollout(env, Coin(np.array(0.5)), key=KEY, episodes=1, max_steps=9)
 
 
-def test_a_policy_that_returns_nan_is_named():
+@pytest.mark.parametrize("env", [Plain(), "swing-up"], ids=["by interface", "compiled"])
+def test_a_policy_that_returns_nan_is_named(env):
     with pytest.raises(ValueError, match="policy Gaussian: expected finite actions"):
-        rollout(Plain(), Gaussian(np.array([np.nan]), np.ones(1)), key=KEY, episodes=1, max_steps=9)
+        rollout(env, Gaussian(np.array([np.nan]), np.ones(1)), key=KEY, episodes=1, max_steps=9)
+
+
+def test_an_action_outside_the_space_is_named():
+    with pytest.raises(ValueError, match=r"policy Constant: expected actions of Discrete\(2\), got 2"):
+        rollout(Drifting({"bad": ""}), Constant(np.array(2)), key=KEY, episodes=3, max_steps=9)
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,11 @@ def test_a_second_call_computes_nothing_again_and_more_trials_may_follow(finishe
         ValueError, match=r"trials: expected more than 1, of which .*linear-program.* has finished more"
     ):
         Study.prepare(parsed(DECLARATION, "tiny"), copy, trials=1)
+    shutil.rmtree(copy / "gridworld/linear-program/none/seed-2981")  # as one that failed, with a finished one after it
+    Study.prepare(parsed(DECLARATION, "tiny"), copy, trials=3).run()
+    shutil.rmtree(copy / "gridworld/linear-program/none/seed-2981")
+    with pytest.raises(ValueError, match=r"trials: expected more than 1, of which .*linear-program"):
+        Study.prepare(parsed(DECLARATION, "tiny"), copy, trials=1)
 
 
 def test_a_damaged_trial_is_given_up_and_the_others_go_on(finished, tmp_path, monkeypatch):

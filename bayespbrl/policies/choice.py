@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -14,7 +14,7 @@ from bayespbrl import checks
 from bayespbrl.policies.batch import entropies
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
-from bayespbrl.policies.policy import Policy, is_discrete, is_pytree
+from bayespbrl.policies.policy import ContinuousPolicy, Policy, is_discrete, is_pytree
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
@@ -88,7 +88,7 @@ def fitting(policy: Policy, observation_space: Space[Any], action_space: Space[A
                 raise ValueError("one that is no JAX pytree of arrays")
             entropies(policy, observation[None])
             if not is_discrete(policy):
-                policy.action_standard_deviation(observation[None])
+                cast(ContinuousPolicy, policy).action_standard_deviation(observation[None])
     except Exception as error:
         got = checks.reason(error)
     if got != expected:

@@ -34,14 +34,11 @@ def expert_of(learner: Learner) -> Expert:
 
 def _first_returns(learner: Learner) -> Float[np.ndarray, " episode"]:
     """Returns of the first policy, of what the expert is shown: whole trajectories, or clips."""
-    settings = learner.settings
-    episodes = {
-        "key": jax.random.key(settings.seed),
-        "episodes": EPISODES,
-        "max_steps": settings.rollouts.max_steps,
-    }
-    if settings.questions.clip_steps is None:
-        return rollouts.returns(learner.environment, learner.first_policy(), **episodes).total
-    whole = rollouts.rollout(learner.environment, learner.first_policy(), **episodes)
-    clips = settings.questions.clips(whole, rng=np.random.default_rng(settings.seed))
+    questions, seed = learner.settings.questions, learner.settings.seed
+    environment, policy, steps = learner.environment, learner.first_policy(), learner.settings.rollouts.max_steps
+    key = jax.random.key(seed)
+    if questions.clip_steps is None:
+        return rollouts.returns(environment, policy, key=key, episodes=EPISODES, max_steps=steps).total
+    whole = rollouts.rollout(environment, policy, key=key, episodes=EPISODES, max_steps=steps)
+    clips = questions.clips(whole, rng=np.random.default_rng(seed))
     return np.array([clip.total_reward for clip in clips_of(whole, clips)])
