@@ -9,7 +9,7 @@ class Step(NamedTuple):
     """The state of a baseline after an answer.
 
     Attributes:
-      answers: number of answers so far, ties included.
+      answers: number of questions so far, ties and those that were skipped included.
       pairs: those that stated a preference.
       policy: what it would act by now.
     """
