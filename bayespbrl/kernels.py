@@ -19,7 +19,7 @@ from bayespbrl import checks
 Vector = Float[Array, " s"] | Float[np.ndarray, " s"]
 Rows = Float[Array, "d s"] | Float[np.ndarray, "d s"]
 SMALLEST_SUM = 1e-200  # of a row of products of exponentials: below it they have lost digits
-FAR = 1e6  # bandwidths from the middle beyond which the expansion of the square loses more than 1e-3
+FAR = 1e6  # bandwidths from the middle, from where on the expansion of the square may lose more than 1e-4
 ROWS_AT_A_TIME = 1024  # keeps a block of a wide kernel matrix in the processor's cache between its three passes
 
 

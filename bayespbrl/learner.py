@@ -267,8 +267,7 @@ class Learner:
             began = time.perf_counter()
             answer = parse_answer(expert(*query.trajectories))
             seconds = None if answerer is None else time.perf_counter() - began
-            theirs = self.state.previous is not None and self.state.past[-1].answerer == answerer
-            vain = vain + 1 if answer is Answer.UNDO and not theirs else 0
+            vain = vain + 1 if answer is Answer.UNDO and not self.state.may_undo(answerer) else 0
             if vain == VAIN_UNDOS:
                 raise ValueError(f"expert: expected an answer, because there is none to take back, got {vain} undos")
             if not vain:  # else the same question again

@@ -148,8 +148,7 @@ def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episode
 def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
     """The pure functions; None where a wrapper or subclass, such as a user's, may change the environment."""
     inner = env.unwrapped
-    pure = isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and plainly_wrapped(env)
-    if not (isinstance(inner, FunctionalEnv) and pure and is_pytree(policy)):
+    if not (isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and plainly_wrapped(env) and is_pytree(policy)):
         return None
     functional.check(inner.dynamics, environment_name(env))
     return inner.dynamics
@@ -160,12 +159,16 @@ def _check_actions(
 ) -> None:
     """Check the actions that were taken; JAX would take the nearest of a discrete space."""
     taken = actions[np.arange(actions.shape[1]) < lengths[:, None]]
-    if not np.isfinite(taken).all():
-        raise ValueError(f"policy {type(policy).__name__}: expected finite actions, got NaN or infinity")
+    _check_finite(policy, taken)
     if (outside := outside_of(dynamics.action_space, taken)).any():
         raise ValueError(
             f"policy {type(policy).__name__}: expected actions of {dynamics.action_space}, got {taken[outside][0]}"
         )
+
+
+def _check_finite(policy: Sampler, actions: Shaped[np.ndarray, "n ..."]) -> None:
+    if not np.isfinite(actions).all():
+        raise ValueError(f"policy {type(policy).__name__}: expected finite actions, got NaN or infinity")
 
 
 def _first_not_finite(observations: Shaped[np.ndarray, "n t1 ..."], rewards: Float[np.ndarray, "n t"]) -> int:
@@ -196,9 +199,7 @@ def _start(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Running, Key[Array, 
 
 def _of_later_types(dynamics: FuncEnv, key: Key[Array, ""], state: Any) -> Any:
     """A first state with the types of later ones: whole numbers may become others after a step."""
-    space = dynamics.action_space
-    action = jnp.zeros(space.shape or (), float if isinstance(space, Box) else int)
-    later = jax.eval_shape(partial(functional.step, dynamics), key, state, action)[0]
+    later = jax.eval_shape(partial(functional.step, dynamics), key, state, functional.zero_action(dynamics))[0]
     return jax.tree.map(lambda a, b: a if a.dtype == b.dtype else a.astype(b.dtype), state, later)
 
 
@@ -330,8 +331,7 @@ def _by_interface(
     def act(first: int, step: int, observations: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, "n ..."]:
         with jax.enable_x64(True):
             actions = np.asarray(choose(policy, policy_key, first * blocks + step // hold, observations))
-        if not np.isfinite(actions).all():
-            raise ValueError(f"policy {type(policy).__name__}: expected finite actions, got NaN or infinity")
+        _check_finite(policy, actions)
         return actions
 
     time_limit = steps if explicit else None

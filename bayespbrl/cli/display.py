@@ -53,10 +53,14 @@ def run_to_the_end(
         else:
             _run_with_bar(learner, _simulated(learner, directory))
     except KeyboardInterrupt:
-        again = shlex.join(["bayespbrl", "resume", str(directory), *(f"--answerer={name}" for name in answerers)])
-        console.print(f"\nStopped. Nothing is lost: {again}")
+        console.print(f"\nStopped. Nothing is lost: {_again('resume', directory, answerers)}")
         raise
     show_run(learner, directory)
+
+
+def _again(command: str, directory: Path, answerers: Sequence[str]) -> str:
+    """The command that continues a run, for the same people."""
+    return shlex.join(["bayespbrl", command, str(directory), *(f"--answerer={name}" for name in answerers)])
 
 
 def ask_on_page(
@@ -84,7 +88,7 @@ def ask_on_page(
     from bayespbrl.people.page import Page
     from bayespbrl.people.session import Session
 
-    again = shlex.join(["bayespbrl", "ask", str(directory), *(f"--answerer={name}" for name in answerers)])
+    again = _again("ask", directory, answerers)
     session = Session(learner, most_answers=answers, answerer=answerers or None, practice=practice)
     page = Page(session, host=place.host, port=place.port)
     console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:")

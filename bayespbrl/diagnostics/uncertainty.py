@@ -206,7 +206,7 @@ def plot_greedy(greedy: xr.Dataset, axes: Axes) -> Axes:
 
 
 def thinned(tree: xr.DataTree, number: int) -> xr.DataTree:
-    """A posterior with at most `number` draws, evenly spaced over the chains, and at least one a chain.
+    """A posterior with about `number` draws, evenly spaced over the chains, and at least one a chain.
 
     Raises:
       ValueError: a number < 1.

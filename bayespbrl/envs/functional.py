@@ -52,6 +52,12 @@ def step(dynamics: FuncEnv, key: Key[Array, ""], state: Any, action: Any) -> tup
     return next_state, observation, reward, dynamics.terminal(next_state, terminal_key)
 
 
+def zero_action(dynamics: FuncEnv) -> Array:
+    """An action of zeros, which tracing needs; follows its caller's dtype."""
+    space = dynamics.action_space
+    return jnp.zeros(space.shape or (), float if isinstance(space, Box) else int)
+
+
 @lru_cache(maxsize=64)
 def check(dynamics: FuncEnv, name: str) -> None:
     """Check that a step can be traced, and gives an observation of the space, one reward and one `terminal`.
@@ -59,19 +65,18 @@ def check(dynamics: FuncEnv, name: str) -> None:
     Raises:
       ValueError: what the functions raise, or a result of another shape.
     """
-    space, key = dynamics.action_space, jax.random.key(0)
+    key = jax.random.key(0)
     try:
         with jax.enable_x64(True):
-            action = jnp.zeros(space.shape or (), float if isinstance(space, Box) else int)
             state, first = jax.eval_shape(partial(reset, dynamics), key)
-            _, observation, reward, terminal = jax.eval_shape(partial(step, dynamics), key, state, action)
+            later = jax.eval_shape(partial(step, dynamics), key, state, zero_action(dynamics))
     except Exception as error:
         raise ValueError(f"environment {name} failed: {type(error).__name__}: {error}") from error
     shape = dynamics.observation_space.shape or ()
-    expected = {"observation": shape, "reward": (), "terminal": ()}
-    for part, got in (("observation", first), ("observation", observation), ("reward", reward), ("terminal", terminal)):
-        if got.shape != expected[part]:
-            raise ValueError(f"environment {name}: {part}: expected shape {expected[part]}, got {got.shape}")
+    names, shapes = ("observation", "observation", "reward", "terminal"), (shape, shape, (), ())
+    for part, got, expected in zip(names, (first, *later[1:]), shapes, strict=True):
+        if got.shape != expected:
+            raise ValueError(f"environment {name}: {part}: expected shape {expected}, got {got.shape}")
 
 
 # One compilation for all environments over the same dynamics object (hashed by identity).

@@ -255,8 +255,7 @@ def to_plain(
         _check_number(space, value)
         return np.eye(int(space.n))[int(value - space.start)]
     if isinstance(space, Discrete):
-        if not (np.isfinite(value) and value == int(value)):
-            raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
+        _check_number(space, value, within=False)
         return np.int64(value - space.start)
     if isinstance(space, Box):
         return np.reshape(value, -1)
@@ -273,8 +272,10 @@ def given_to_plain(space: gymnasium.Space[Any], value: Any, actions: gymnasium.S
     return to_plain(space, value, actions)
 
 
-def _check_number(space: Discrete, value: Any) -> None:
-    if not (space.start <= value < space.start + space.n and value == int(value)):
+def _check_number(space: Discrete, value: Any, *, within: bool = True) -> None:
+    """Check that `value` is a whole number, and one of `space` unless that is looked at elsewhere."""
+    outside = within and not space.start <= value < space.start + space.n
+    if outside or not np.isfinite(value) or value != int(value):
         raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
 
 

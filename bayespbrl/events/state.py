@@ -112,6 +112,10 @@ class LearnerState:
             return True
         return any(past.number == query.repeats and past.answerer == person for past in self.past)
 
+    def may_undo(self, person: str | None) -> bool:
+        """Whether the last answer can be taken back, and is this person's, None without a name."""
+        return bool(self.before) and self.past[-1].answerer == person
+
     @property
     def started(self) -> int:
         """Iterations completed when the present policy was started."""

@@ -49,7 +49,7 @@ def described(learner: Learner, state: LearnerState, phase: str, *, turn: int, a
         "answered": state.preferences.answers,
         "budget": learner.settings.questions.answers,
         "iteration": state.iteration,
-        "undo": state.previous is not None and state.past[-1].answerer == answerer,
+        "undo": state.may_undo(answerer),
         "answerer": answerer,
         "practice": None,
         "notice": "",

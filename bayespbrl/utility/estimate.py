@@ -41,10 +41,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def thinned(self, number: int) -> Self:
-        """At most `number` of the draws, but one of each chain, for `utilities` and `utilities_and_draws` alone.
-
-        Itself without draws.
-        """
+        """About `number` of the draws, for `utilities` and `utilities_and_draws` alone; itself without draws."""
         ...
 
     def hyperparameters(self) -> dict[str, Any] | None:
@@ -64,7 +61,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def likelihood(self, number: int | None = None) -> Likelihood:
-        """Likelihood of the next answer given its margin under each of S draws, at most `number`; margins (S, n)."""
+        """Likelihood of the next answer given its margin under each of S draws, about `number`; margins (S, n)."""
         ...
 
     def tie_thresholds(self, number: int | None = None) -> Float[np.ndarray, "s 1"] | None:
@@ -74,7 +71,7 @@ class UtilityEstimate(Protocol):
     def utilities_and_draws(
         self, states: np.ndarray, *, number: int | None = None
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
-        """`utilities` of n states and S posterior draws of them, at most `number`, in one pass over the features."""
+        """`utilities` of n states and S posterior draws of them, about `number`, in one pass over the features."""
         ...
 
     def mean_utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
@@ -88,7 +85,7 @@ class UtilityEstimate(Protocol):
     def trajectory_draws(
         self, trajectories: Sequence[Trajectory], *, number: int | None = None
     ) -> Float[np.ndarray, "s n"]:
-        """S posterior draws of the utility wᵀψ(τ) of each trajectory, at most `number`."""
+        """S posterior draws of the utility wᵀψ(τ) of each trajectory, about `number`."""
         ...
 
     def differences(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, "c n d"]:

@@ -52,7 +52,7 @@ class PosteriorUtility:
         return int(self.weights.shape[-1])
 
     def thinned(self, number: int) -> Self:
-        """The same with at most `number` draws, in memory; no more than `utilities_and_draws` needs is kept."""
+        """The same with about `number` draws, in memory; no more than `utilities_and_draws` needs is kept."""
         drawn = self.posterior["posterior"].dataset[["setting", "utility_weights"]]
         few = drawn.isel(draw=slice(None, None, spacing(drawn["setting"].size, number))).load()
         return replace(self, posterior=DataTree.from_dict({"posterior": few}))
@@ -185,5 +185,5 @@ class PosteriorUtility:
 
 
 def spacing(total: int, number: int | None) -> int:
-    """Every how manieth draw of each chain leaves at most `number` of `total`, but one of each chain; None: every."""
+    """Distance between the draws of each chain that leaves about `number` of `total`; 1 for None, which is all."""
     return 1 if number is None else -(-total // checks.whole("number", number))
