@@ -65,7 +65,7 @@ class Stopwatch:
     """Seconds by step; each counts for the step that was entered last.
 
     Attributes:
-      seconds: by step.
+      seconds: by step; their sum is `elapsed`.
       programs: number of programs compiled so far.
     """
 
@@ -73,8 +73,13 @@ class Stopwatch:
         self.seconds: dict[str, float] = {REST: 0.0, "compilation": 0.0}
         self.programs = 0
         self._inside = [REST]
-        self._since = time.perf_counter()
+        self._began = self._since = time.perf_counter()
         self._compiled: list[tuple[float, float]] = []  # intervals, disjoint and in order
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds from the beginning to the last switch."""
+        return self._since - self._began
 
     def switch(self) -> None:
         """Add the time since the last switch to the innermost step."""
@@ -154,7 +159,7 @@ def measure(environment: str, **settings: Any) -> dict[str, Any]:
         "answers": learner.preferences.answers,
         "transitions": sum(len(trajectory) for trajectory in learner.trajectories),
         "value": learner.iterations[-1]["value"],
-        "seconds": round(began[-1] - began[0], 3),
+        "seconds": round(stopwatch.elapsed, 3),
         "seconds_by_step": dict(sorted(steps.items(), key=lambda item: -item[1])),
         "seconds_by_iteration": [round(after - before, 3) for before, after in itertools.pairwise(began)],
         "programs_compiled": stopwatch.programs,

@@ -71,7 +71,7 @@ def test_the_seconds_of_the_steps_of_a_trial_add_up():
     named = {"features", "sampler", "LSTD", "dual", "policy fit", "CMA-ES", "rollouts", "evaluation", "compilation"}
     assert named <= set(steps)
     assert all(seconds > 0 for seconds in steps.values())
-    assert sum(steps.values()) == pytest.approx(result["seconds"], abs=0.1, rel=0.01)
+    assert sum(steps.values()) == pytest.approx(result["seconds"], abs=0.01)  # one clock: what rounding leaves
     assert steps["rest"] < 0.1 * result["seconds"]
     assert len(result["seconds_by_iteration"]) == result["iterations"] == 1
     assert result["answers"] == 2
