@@ -19,6 +19,7 @@ from toys import SHORT
 import bayespbrl
 from bayespbrl import ReturnExpert
 from bayespbrl.cli.commands import main
+from bayespbrl.diagnostics.estimates import predicted_answer
 from bayespbrl.diagnostics.predictions import answer_probabilities
 from bayespbrl.diagnostics.prequential import score_predictions
 from bayespbrl.diagnostics.report import document as report_document
@@ -218,6 +219,45 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(g
     utilities = run.estimate.trajectory_utilities(both)
     margin = (utilities[0] - utilities[1]) * (1 if said == "first" else -1)
     assert float(table["margin"][3]) == pytest.approx(margin, rel=1e-6)  # in the units of the utility
+
+
+@pytest.mark.slow
+def test_a_person_without_a_name_beside_named_ones_is_predicted_as_that_person(tmp_path):
+    learner = bayespbrl.start(
+        "gridworld",
+        tmp_path / "run",
+        preset="paper",
+        expert="other",
+        answers=10,
+        seed=3,
+        repeats=0,
+        evaluation_episodes=2,
+        trajectories_per_iteration=4,
+    )
+    expert, turn = bayespbrl.ReturnExpert(), 0
+    while queries := learner.ask():
+        turn += 1
+        if turn % 2:
+            learner.tell(["first"])  # a strong side bias
+        else:
+            learner.tell([expert(*queries[0].trajectories)], answerer="Ada")
+    contents, differences = read_contents(tmp_path / "run"), []
+    for answer in contents.answers:
+        if answer.answerer is None and answer.iteration > 2:
+            before = read_iteration(contents.path / "iterations" / f"{answer.iteration - 1:04d}.nc", "improved")
+            pair = [contents.compared[number] for number in (answer.first, answer.second)]
+            assert answer.predicted == predicted_answer(before["estimate"], *pair, answerer="")[0]
+            differences.append(answer.predicted - predicted_answer(before["estimate"], *pair)[0])  # without a side bias
+    assert len(differences) >= 3
+    assert max(map(abs, differences)) > 0.1
+
+
+def test_the_first_answers_which_no_posterior_predicted_are_not_scored(contents):
+    first = [answer for answer in contents.answers if answer.iteration == 1]
+    assert first
+    assert all(answer.predicted == 0.5 for answer in first)
+    stated = [answer for answer in contents.answers if answer.iteration > 1 and answer.row is not None]
+    assert report_tables.prequential_table(contents).sizes["prediction"] == len(stated)
 
 
 @pytest.mark.slow

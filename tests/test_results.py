@@ -333,6 +333,34 @@ def test_predictions_are_those_that_the_report_shows_and_old_runs_are_read_anew(
     assert (data / "results.md").read_text() == (tmp_path / "run" / "results.md").read_text()
 
 
+@pytest.mark.slow
+def test_what_the_tables_have_of_trials_that_are_damaged_or_gone_stays_and_is_named(monkeypatch, tmp_path):
+    without_processes(monkeypatch)
+    text = RUN.replace("trials = 1", "trials = 2").replace("iterations = 4", "iterations = 3")
+    study = Study.prepare(parsed(text, "run"), tmp_path / "run")
+    assert study.run() == []
+    write_results(tmp_path / "run")
+    before = {name: (tmp_path / "run" / name).read_text() for name in ("iterations.csv", "answers.csv")}
+    trial = sorted((tmp_path / "run" / "gridworld").iterdir())[0]
+    assert f",{trial.name.removeprefix('seed-')}," in before["answers.csv"]
+
+    def after(harm):
+        harm()
+        page = write_results(tmp_path / "run")[0].read_text()
+        assert {name: (tmp_path / "run" / name).read_text() for name in before} == before
+        return page
+
+    def cut():
+        with (trial / "iterations" / "0002.nc").open("r+b") as file:
+            file.truncate(2000)
+
+    with pytest.warns(UserWarning, match=f"{trial.name}: .*0002.nc"):
+        assert "Not read" in after(cut)
+    with pytest.warns(UserWarning, match=f"not read: .*{trial.name}"):
+        assert trial.name in after(lambda: (trial / "settings.json").write_text("{"))
+    assert "Not read" not in after(lambda: shutil.rmtree(trial))
+
+
 def test_studies_whose_results_would_overwrite_each_other_are_refused(made, tmp_path, monkeypatch, capsys):
     other = tmp_path / "elsewhere" / "made"
     shutil.copytree(made, other)

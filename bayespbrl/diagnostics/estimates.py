@@ -31,7 +31,8 @@ def predicted_answer(
 
     Args:
       estimate: with a posterior.
-      answerer: who is asked; a name that the posterior does not know, or None, is any of its answerers.
+      answerer: who is asked, as the posterior names them: "" who gave no name where others did. A name that it does not
+        know, or None, has the lapse rate of all of them together, and no side bias.
 
     Returns:
       that, and the probability that either is preferred: 1 where nobody called two equal so far.

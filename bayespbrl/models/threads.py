@@ -55,11 +55,15 @@ def one_blas_thread() -> Iterator[None]:
         limit.leave()
 
 
+def cores() -> int:
+    """The number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def most_threads() -> int:
     """The number of threads of a computation: one for each core that this process may use, or fewer if so set."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     given = os.environ.get(VARIABLE, "")
-    return min(cores, int(given)) if given.isdecimal() and int(given) else cores
+    return min(cores(), int(given)) if given.isdecimal() and int(given) else cores()
 
 
 def in_threads(function: Callable[[Part], Result], parts: Iterable[Part]) -> list[Result]:

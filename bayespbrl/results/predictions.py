@@ -1,26 +1,29 @@
 """Each answer of a study's runs with the probability that the learner gave it beforehand: `answers.csv`."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from bayespbrl.diagnostics.report.contents import read_contents
+from bayespbrl.models.threads import cores
 from bayespbrl.preferences import Answer
 from bayespbrl.results.study_data import ANSWER_COLUMNS
-from bayespbrl.runs.files import write_file
 from bayespbrl.studies.processes import trial_processes
-from bayespbrl.studies.study import Study
+from bayespbrl.studies.study import Study, write_lines
 
 FEW = 8  # runs that are not worth a process
 
 
-def write_predictions(study: Study) -> Path:
+def write_predictions(study: Study) -> list[str]:
     """Write `answers.csv` of the finished trials: predictions by the posterior at the time of the question.
 
-    The first iteration, which has no posterior, and answers that state no preference are left out. To read a run takes
-    seconds, so where there are many, each core has a process.
+    The first iteration, which has no posterior, and answers that state no preference are left out. What the file has of
+    trials whose run directories are gone or damaged stays. To read a run takes seconds, so where there are many, each
+    core has a process.
+
+    Returns:
+      what could not be read, a line each.
     """
     runs = [
         (declared.levels, seed, seeds.row.path(seed))
@@ -32,22 +35,26 @@ def write_predictions(study: Study) -> Path:
     if len(runs) <= FEW:
         predicted = [_predicted(path) for path in paths]
     else:
-        with trial_processes(os.cpu_count() or 1) as processes:
+        with trial_processes(cores()) as processes:
             predicted = list(processes.map(_predicted, paths))
-    lines = [
-        [*levels, seed, *answer]
-        for (levels, seed, _), answers in zip(runs, predicted, strict=True)
-        for answer in answers
+    whole = [
+        (levels, seed, answers)
+        for (levels, seed, _), (answers, damage) in zip(runs, predicted, strict=True)
+        if not damage
     ]
-    file = study.directory / "answers.csv"
+    lines = [[*levels, seed, *answer] for levels, seed, answers in whole for answer in answers]
+    read = study.trials_with(False) | {(levels, seed) for levels, seed, _ in whole}
     table = pd.DataFrame(lines, columns=ANSWER_COLUMNS)
-    write_file(file, table.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
-    return file
+    write_lines(study.directory / "answers.csv", table, study.declaration, read)
+    return [f"{path}: {damage}" for path, (_, damage) in zip(paths, predicted, strict=True) if damage]
 
 
-def _predicted(run: Path) -> list[tuple[int, int, float, bool]]:
-    return [
+def _predicted(run: Path) -> tuple[list[tuple[int, int, float, bool]], str]:
+    """Question, iteration, prediction and whether "first" was answered, of each answer; what is damaged."""
+    contents = read_contents(run)
+    answers = [
         (answer.question, answer.iteration, answer.predicted, answer.answer is Answer.FIRST)
-        for answer in read_contents(run).answers
+        for answer in contents.answers
         if answer.iteration > 1 and answer.row is not None and np.isfinite(answer.predicted)
     ]
+    return answers, " ".join(warning.what for warning in contents.damage)

@@ -126,7 +126,8 @@ def pairs_table(data: StudyData) -> pd.DataFrame:
         reference = None if declared is None else data.row_of(declared)
         if declared is None or reference is None or level is None:
             continue
-        shared = sorted(set(row.seeds) & set(reference.seeds))
+        if not (shared := sorted(set(row.seeds) & set(reference.seeds))):
+            continue
         places = [[side.seeds.index(seed) for seed in shared] for side in (row, reference)]
         line = dict(zip(AXES, row.declared.levels, strict=True))
         line |= {"against": _without_task(declared), "pairs": str(len(shared))}

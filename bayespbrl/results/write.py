@@ -1,5 +1,6 @@
 """`bayespbrl results`: the tables of a study in Markdown and CSV, and its figures, beside its data."""
 
+import warnings
 from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
@@ -34,12 +35,12 @@ TITLES = {
 NOTES = {
     "values": "value of the kept policy at the end of a trial, and after so many answers, median [lower quartile]. "
     "Relative value: 0 is the random policy, 1 the median of the reference runs on the hidden reward. Seeds left out: "
-    "their trials met no preference at first and were drawn again, or were given up. Difference: median difference in "
-    "pairs of the same seed, against the first method with the same noise and variant (of the first method: against "
-    "its first noise), after the answers that both were allowed; a trial that ended with fewer keeps its policy. p "
-    "values (Wilcoxon) are adjusted for the comparisons of the table by Holm, and by Benjamini and Hochberg (false "
-    "discovery). Brackets elsewhere: 95 % intervals, bootstrap over trials, of failed trials exact (Clopper and "
-    "Pearson).",
+    "their trials met no preference at first and were drawn again, were given up, or are not finished. Difference: "
+    "median difference in pairs of the same seed, against the first method with the same noise and variant (of the "
+    "first method: against its first noise), after the answers that both were allowed; a trial that ended with fewer "
+    "keeps its policy. p values (Wilcoxon) are adjusted for the comparisons of the table by Holm, and by Benjamini and "
+    "Hochberg (false discovery). Brackets elsewhere: 95 % intervals, bootstrap over trials, of failed trials exact "
+    "(Clopper and Pearson).",
     "kept": "value, median [lower quartile], of the policy that a run keeps, of its newest, and of the best of the "
     "run, which only the hidden reward knows. Within 3 % of the best: of what that gains over the random policy.",
     "pairs": "pairs of the same seed: in how many the trial needed fewer answers than the one it is compared with, and "
@@ -57,8 +58,13 @@ def columns_of(names: Iterable[str]) -> str:
     return "\n".join(f"- **{TITLES[name]}**: {NOTES[name]}" for name in names)
 
 
-def refreshed(directory: Path) -> StudyData:
-    """The data of a study, first rewritten from its run directories where this version made them."""
+def refreshed(directory: Path) -> tuple[StudyData, list[str]]:
+    """The data of a study, first rewritten from its run directories where this version made them.
+
+    Returns:
+      the data, and what could not be read, a line each: what the tables had of it stands.
+    """
+    unread = []
     description = read_study_json(directory)
     declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
     ours = description.get("version") == version("bayespbrl")
@@ -66,8 +72,9 @@ def refreshed(directory: Path) -> StudyData:
         trials = description.get("trials")
         study = Study.prepare(declaration, directory, trials=trials if isinstance(trials, int) else None)
         study.write_table()
-        write_predictions(study)
-    return read_study(directory)
+        unread = [f"{seeds.row.path(seed)}: {why}" for seeds in study.rows for seed, why in seeds.damaged.items()]
+        unread += write_predictions(study)
+    return read_study(directory), unread
 
 
 def tables_of(data: StudyData) -> dict[str, pd.DataFrame]:
@@ -103,11 +110,16 @@ def write_results(directory: Path | str, out: Path | str | None = None) -> list[
     Raises:
       ValueError: no study, none of its trials finished, or damaged data.
     """
-    data = refreshed(Path(directory))
+    data, unread = refreshed(Path(directory))
+    if unread:
+        warnings.warn(f"not read: {'; '.join(unread)}", stacklevel=2)
     out = Path(directory if out is None else out)
     out.mkdir(parents=True, exist_ok=True)
     written, tables = [], tables_of(data)
     sections = [f"# {data.declaration.title}", data.source]
+    if unread:
+        sections.append("Not read, so that only what the tables had of it counts:")
+        sections.append("\n".join(f"- {line}" for line in unread))
     for name, table in tables.items():
         written.append(out / f"{name}.csv")
         write_file(written[-1], table.to_csv(index=False, lineterminator="\n"))

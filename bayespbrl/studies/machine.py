@@ -1,17 +1,17 @@
 """What a study ran on: the machine, what rounds its sums, and the source."""
 
-import os
 import platform
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
+from bayespbrl.models.threads import cores
+
 
 def machine() -> str:
     """The machine in words: processor, cores, Python and JAX."""
     processor = platform.processor() or platform.machine()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{processor}, {cores} cores, Python {platform.python_version()}, jax {version('jax')}"
+    return f"{processor}, {cores()} cores, Python {platform.python_version()}, jax {version('jax')}"
 
 
 def rounding() -> dict[str, str]:

@@ -8,11 +8,12 @@ TASK/METHOD/…/seed-1000/   the run directories
 
 import json
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
+from io import StringIO
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -41,6 +42,7 @@ FIGURES = {
     "kl_bound": "kl_bound",
     "seconds": "seconds",
 }  # the columns of `iterations.csv` after the levels, the seed and the iteration, by the names in the summaries
+Trial = tuple[tuple[str, str, str, str], int]  # the levels of its row, and its seed
 WHENCE = ("source", "machine", "rounding")
 SECONDS = ("seconds_utility", "seconds_improvement", "seconds_evaluation")
 
@@ -171,15 +173,35 @@ class Study:
         write_file(self.directory / "study.json", json.dumps(content, indent=1) + "\n")
 
     def write_table(self) -> None:
-        """Write `iterations.csv` of the finished trials."""
-        tables = [
-            _table_of(declared.levels, seeds)
-            for declared, seeds in zip(self.declaration.rows, self.rows, strict=True)
-            if seeds.with_outcome(True)
-        ]
-        if tables:
-            text = pd.concat(tables).to_csv(index=False, lineterminator="\n", float_format="%.6g")
-            write_file(self.directory / "iterations.csv", text)
+        """Write `iterations.csv` of the finished trials; lines of those whose run directories are gone stay."""
+        finished = [row for row in zip(self.declaration.rows, self.rows, strict=True) if row[1].with_outcome(True)]
+        if finished:
+            lines = pd.concat([_table_of(declared.levels, seeds) for declared, seeds in finished])
+            write_lines(self.directory / "iterations.csv", lines, self.declaration, self.trials_with(True))
+
+    def trials_with(self, outcome: bool) -> set[Trial]:
+        """The trials on disk that count (True) or were redrawn (False)."""
+        rows = zip(self.declaration.rows, self.rows, strict=True)
+        return {(declared.levels, seed) for declared, seeds in rows for seed in seeds.with_outcome(outcome)}
+
+
+def write_lines(file: Path, lines: pd.DataFrame, declaration: Declaration, read: Set[Trial]) -> None:
+    """Write a table of trials, columns `AXES`, `seed` and others. Lines that it has of trials not in `read` stay."""
+    text = lines.to_csv(index=False, lineterminator="\n", float_format="%.6g")
+    if file.exists():
+        new, kept = (pd.read_csv(source, dtype=str, keep_default_na=False) for source in (StringIO(text), file))
+        if list(kept.columns) == list(new.columns):
+            kept = kept[[trial not in read for trial in _trials(kept)]]
+            whole = pd.concat([new, kept])
+            places = {row.levels: place for place, row in enumerate(declaration.rows)}
+            order = [(places.get(levels, len(places)), seed) for levels, seed in _trials(whole)]
+            text = whole.iloc[sorted(range(len(order)), key=order.__getitem__)].to_csv(index=False, lineterminator="\n")
+    write_file(file, text)
+
+
+def _trials(lines: pd.DataFrame) -> list[Trial]:
+    columns = (lines[name].to_list() for name in (*AXES, "seed"))
+    return [((a, b, c, d), int(seed)) for a, b, c, d, seed in zip(*columns, strict=True)]
 
 
 def _table_of(levels: tuple[str, ...], seeds: Seeds) -> pd.DataFrame:

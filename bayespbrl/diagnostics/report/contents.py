@@ -258,7 +258,7 @@ def _predicted(contents: RunContents, answer: AnsweredQuestion) -> AnsweredQuest
         return replace(answer, predicted=0.5)  # without any answer, either is equally probable
     if contents.posterior is None or contents.features_missing:
         return answer
-    predicted, stated = predicted_answer(contents.estimate, *both, answerer=answer.answerer)
+    predicted, stated = predicted_answer(contents.estimate, *both, answerer=answer.answerer or "")
     return replace(answer, predicted=predicted, stated=stated)
 
 

@@ -115,9 +115,10 @@ def _by_last_estimate(
 def prequential_table(contents: RunContents) -> xr.Dataset:
     """Scores and reliability curve of the predictions that the learner made of the answers, before each was given.
 
-    As of `score_predictions`, without ties, skips and answers that could not be predicted.
+    As of `score_predictions`, without ties, skips, answers that could not be predicted, and those of the first
+    iteration, which has no posterior.
     """
-    scored = [a for a in contents.answers if a.row is not None and np.isfinite(a.predicted)]
+    scored = [a for a in contents.answers if a.iteration > 1 and a.row is not None and np.isfinite(a.predicted)]
     predicted = np.array([answer.predicted for answer in scored])
     observed = np.array([answer.answer is Answer.FIRST for answer in scored], dtype=bool)
     return score_predictions(np.clip(predicted, 0, 1), observed)
