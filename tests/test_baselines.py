@@ -3,6 +3,7 @@
 import itertools
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 from test_trials import without_processes
@@ -118,6 +119,10 @@ def test_baselines_refuse_tasks_that_are_not_theirs():
         next(programming_by_feedback(open_environment("swing-up"), ReturnExpert(), answers=1, seed=0))
     with pytest.raises(ValueError, match="baseline epmc: expected observations in a bounded Box"):
         next(every_visit_preferences(open_environment("gridworld"), ReturnExpert(), answers=1, seed=0))
+    twelve = Push(1)
+    twelve.observation_space = gymnasium.spaces.Box(-1, 1, (12,))  # two billion cells
+    with pytest.raises(ValueError, match="observations of at most 8 dimensions, as each has 6 cells, got 12"):
+        epmc.GridPolicy.initial(twelve)
 
 
 def test_a_preference_says_the_more_the_fewer_states_both_visited():

@@ -63,6 +63,11 @@ def test_scores_of_two_predictions_by_hand():
     assert float(result["miscalibration"]) == pytest.approx(0.265)
 
 
+def test_at_least_one_set_of_answers_is_simulated():
+    with pytest.raises(ValueError, match="simulations: expected a whole number >= 1, got 0"):
+        score_predictions(np.array([0.8]), np.array([True]), simulations=0)
+
+
 @pytest.mark.slow
 def test_expected_scores_and_their_spread_are_those_of_answers_drawn_from_the_predictions():
     predicted = np.array([0.05, 0.3, 0.6, 0.98])

@@ -66,6 +66,8 @@ def test_gains_are_counted_by_what_the_schedule_said():
     assert np.all(gain_calibration([], "signal")["updates"] == 0)
     with pytest.raises(ValueError, match="edges: expected"):
         gain_calibration(runs, edges=(1, 0))
+    with pytest.raises(ValueError, match="runs: expected the iterations of several runs"):
+        gain_calibration(runs[0])
     restarted = [
         {"iteration": 1, "value_newest": 5.0},
         {"iteration": 2, "value_newest": 1.0, "schedule": {"agreement": 0.99}, "restarted": 1},  # no update of the last

@@ -221,6 +221,13 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(g
     assert float(table["margin"][3]) == pytest.approx(margin, rel=1e-6)  # in the units of the utility
 
 
+def test_nothing_is_called_undominated_where_nothing_was_compared(tmp_path):
+    learner = start(tmp_path / "run", iterations=1)
+    while questions := learner.ask():
+        learner.tell(["skip"] * len(questions))
+    assert "Undominated" not in read(bayespbrl.load(tmp_path / "run").report()).text
+
+
 @pytest.mark.slow
 def test_a_person_without_a_name_beside_named_ones_is_predicted_as_that_person(tmp_path):
     learner = bayespbrl.start(
@@ -540,6 +547,11 @@ def test_an_answer_that_the_estimate_contradicts_is_named(tmp_path):
         each for each in warnings_of(replace(contents, answers=reversed_answers)) if "contradicts" in each.what
     ]
     assert "lapse rate" not in warning.remedy  # a linear program has none
+    assert "features" in warning.remedy
+    known = replace(contents.settings, estimation=replace(contents.settings.estimation, utility="known-reward"))
+    told = warnings_of(replace(contents, answers=reversed_answers, settings=known))
+    assert any("something else than the reward" in each.remedy for each in told)
+    assert not any("features of your own" in each.remedy for each in told)
     rounded = table.assign(margin=("answer", np.array([1.0, -2e-16])))
     assert report_tables.contradicted(rounded).tolist() == [False, False]
 

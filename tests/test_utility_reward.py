@@ -96,6 +96,8 @@ def test_a_discrete_task_of_ours_earns_utility_too(gridworld_run):
 def test_other_spaces_and_runs_without_an_estimate_are_refused(pendulum, tmp_path):
     with pytest.raises(ValueError, match=r"^observation_space: expected Box.*, the run's, got Box"):
         UtilityReward(gymnasium.make("CartPole-v1"), pendulum)
+    with pytest.raises(ValueError, match=r"^env: expected an environment, got 'Pendulum-v1'"):
+        UtilityReward("Pendulum-v1", pendulum)
     bayespbrl.start("Pendulum-v1", tmp_path / "new", **FAST).ask()
     with pytest.raises(ValueError, match="run: expected a run with an estimate of the utility of states, got none yet"):
         UtilityReward(gymnasium.make("Pendulum-v1"), bayespbrl.load(tmp_path / "new"))

@@ -37,6 +37,7 @@ from bayespbrl.policies.policy import AnyArray
 from bayespbrl.preferences import Answer, parse_answer
 
 CELLS = 6  # per dimension of the observation
+MOST_DIMENSIONS = 8  # 1.7 million cells
 LEARNING_RATE = 0.2  # α
 EXPLORATION = 0.1  # η of EXP3
 
@@ -145,12 +146,17 @@ class GridPolicy:
 
     @classmethod
     def initial(cls, environment: gymnasium.Env) -> "GridPolicy":
-        """The uniform policy for an environment; `ValueError` unless its spaces are bounded boxes."""
+        """The uniform policy for an environment; `ValueError` unless its spaces are bounded boxes that a table can cover."""
         seen = _bounded("observations", environment.observation_space)
         acts = _bounded("actions", environment.action_space)
         if acts.shape != (1,):
             raise ValueError(f"baseline epmc: expected actions of one dimension, got {acts.shape[0]}")
         values = np.linspace(acts.low.astype(float), acts.high.astype(float), 3)
+        if seen.shape[0] > MOST_DIMENSIONS:
+            raise ValueError(
+                f"baseline epmc: expected observations of at most {MOST_DIMENSIONS} dimensions, as each has {CELLS} "
+                f"cells, got {seen.shape[0]}"
+            )
         table = np.full((CELLS ** seen.shape[0], len(values)), 1 / len(values))
         return cls(table, seen.low.astype(float), seen.high.astype(float), values, CELLS)
 

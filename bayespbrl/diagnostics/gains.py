@@ -31,12 +31,15 @@ def gain_calibration(
       that was a gain) and its `standard_error`; NaN where a bin is empty.
 
     Raises:
-      ValueError: edges that do not increase.
+      ValueError: edges that do not increase; the iterations of one run, not in a list.
     """
     bounds = np.asarray(edges, dtype=float)
     if bounds.ndim != 1 or len(bounds) < 2 or np.any(np.diff(bounds) <= 0):
         raise ValueError(f"edges: expected at least two increasing numbers, got {edges!r}")
-    pairs = [pair for summaries in runs for pair in _stated_and_gained(summaries, statistic)]
+    of_each = [list(summaries) for summaries in runs]
+    if not all(isinstance(summary, Mapping) for summaries in of_each for summary in summaries):
+        raise ValueError("runs: expected the iterations of several runs, a list for each, got something else")
+    pairs = [pair for summaries in of_each for pair in _stated_and_gained(summaries, statistic)]
     stated, gained = np.reshape(np.array(pairs, dtype=float), (-1, 2)).T
     place = np.clip(np.searchsorted(bounds, stated, side="right") - 1, 0, len(bounds) - 2)
     counts = np.bincount(place, minlength=len(bounds) - 1)

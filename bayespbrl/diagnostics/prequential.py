@@ -140,6 +140,7 @@ def score_predictions(
     observed = checks.flags("observed", observed, len(predicted))
     if not 0 < level < 1:
         raise ValueError(f"level: expected a number in (0, 1), got {level}")
+    checks.whole("simulations", simulations)
     forecasts, place, counts = np.unique(predicted, return_inverse=True, return_counts=True)
     frequency = _isotonic(observed, place, counts)
     draws = np.random.default_rng(seed).random((simulations, len(predicted))) < predicted

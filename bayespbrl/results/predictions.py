@@ -1,5 +1,6 @@
 """Each answer of a study's runs with the probability that the learner gave it beforehand: `answers.csv`."""
 
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,9 @@ def write_predictions(study: Study) -> list[str]:
 
     Returns:
       what could not be read, a line each.
+
+    Raises:
+      ValueError: the processes die, as in a script that is not guarded by `if __name__ == "__main__":`.
     """
     runs = [
         (declared.levels, seed, seeds.row.path(seed))
@@ -35,8 +39,14 @@ def write_predictions(study: Study) -> list[str]:
     if len(runs) <= FEW:
         predicted = [_predicted(path) for path in paths]
     else:
-        with trial_processes(cores()) as processes:
-            predicted = list(processes.map(_predicted, paths))
+        try:
+            with trial_processes(cores()) as processes:
+                predicted = list(processes.map(_predicted, paths))
+        except BrokenExecutor as error:
+            raise ValueError(
+                f"expected processes that read the runs, got none ({error}); in a script of your own, call this under "
+                '`if __name__ == "__main__":`'
+            ) from error
     whole = [
         (levels, seed, answers)
         for (levels, seed, _), (answers, damage) in zip(runs, predicted, strict=True)

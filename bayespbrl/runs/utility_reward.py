@@ -25,11 +25,13 @@ class UtilityReward(gymnasium.Wrapper):
       caution: c of the reward mean − c · standard deviation; a negative one rewards what is unknown.
 
     Raises:
-      ValueError: a run without an estimate of the utility, as before its first answers or with the known reward;
-        another observation or action space than the run's; caution without a posterior.
+      ValueError: no environment; a run without an estimate of the utility, as before its first answers or with the
+        known reward; another observation or action space than the run's; caution without a posterior.
     """
 
     def __init__(self, env: gymnasium.Env, run: Run, *, caution: float = 0.0):
+        if not isinstance(env, gymnasium.Env):
+            raise ValueError(f"env: expected an environment, got {checks.one_line(env)!r}")
         super().__init__(env)
         estimate = run.estimate
         if estimate is None or estimate.features is None:

@@ -134,11 +134,11 @@ def _calibration(scores: xr.Dataset) -> str:
 def _undominated(contents: RunContents) -> Iterator[str]:
     """The best so far, and for how many comparisons it has been so."""
     best = contents.preferences.undominated
-    if not best:
+    compared = [answer for answer in contents.answers if answer.answer is not Answer.SKIP]
+    if not best or not compared:
         return
     size = contents.settings.rollouts.trajectories_per_iteration
     named = ", ".join(f"{n} (of iteration {n // size + 1})" for n in best)
-    compared = [answer for answer in contents.answers if answer.answer is not Answer.SKIP]
     with_it = ({answer.first, answer.second} for answer in compared if best[-1] in (answer.first, answer.second))
     since = max(0, len(set().union(*with_it)) - 2)  # itself, and the one that made it the best
     unbeaten = f" {count(since, 'comparison')} since then found nothing better." if since else ""
