@@ -146,7 +146,7 @@ class GridPolicy:
 
     @classmethod
     def initial(cls, environment: gymnasium.Env) -> "GridPolicy":
-        """The uniform policy for an environment; `ValueError` unless its spaces are bounded boxes that a table can cover."""
+        """The uniform policy for an environment; `ValueError` unless its spaces are bounded boxes, and not large."""
         seen = _bounded("observations", environment.observation_space)
         acts = _bounded("actions", environment.action_space)
         if acts.shape != (1,):
