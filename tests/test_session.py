@@ -28,7 +28,7 @@ from bayespbrl.models.likelihoods import Logistic
 from bayespbrl.people.clips import MOST_BYTES, Clips
 from bayespbrl.people.drawing import SCENES, scene_of
 from bayespbrl.people.foresight import Foresight
-from bayespbrl.people.plots import observation_names
+from bayespbrl.people.plots import draw_plots, observation_names
 from bayespbrl.people.practice import practice_queries
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session, answer_of
@@ -144,6 +144,26 @@ def test_what_is_said_of_a_question_is_how_sure_the_answer_is_and_what_it_is_wor
     assert order[0] == likely
     stop = "That is less than 0.01 bit: further answers change little, and you can stop here."
     assert said["advice"] == (stop if worth < LITTLE else "")
+
+
+def test_what_is_said_of_a_question_counts_ties_once_the_run_has_one():
+    class Tying(Known):
+        def tie_thresholds(self, number):
+            return np.array([[4.0], [0.01]])
+
+    def said(*draws):
+        return said_of(Query(1, 0, 1, 1, (None, None)), LearnerState(*NO_POLICIES, estimate=Tying(*draws)))[0]
+
+    likely = said((0.0, 0.0), (9.0, 0.0))  # a tie by the one draw, the first by the other
+    np.testing.assert_allclose([likely["sure"], likely["worth"]], [0.5, 1.0], atol=1e-3)
+    assert likely["most"] == pytest.approx(1.585, abs=1e-3)
+    both = said((0.0, 0.0), (0.0, 0.0))  # by the one a tie, by the other a coin toss
+    p = 1 / (1 + np.exp(4 * 0.01))
+    entropy = lambda *chances: -sum(chance * np.log2(chance) for chance in chances)  # noqa: E731
+    first, tie = (p + 1 / (1 + np.exp(16.0))) / 2, (2 - 2 * p - 2 / (1 + np.exp(16.0))) / 2
+    of_each = [entropy(p, p, 1 - 2 * p), entropy(*[1 / (1 + np.exp(16.0))] * 2, 1 - 2 / (1 + np.exp(16.0)))]
+    np.testing.assert_allclose([both["sure"]], [tie], atol=1e-6)
+    np.testing.assert_allclose([both["worth"]], [entropy(first, first, tie) - np.mean(of_each)], atol=1e-6)
 
 
 def test_a_person_may_stop_from_the_least_worth_on_and_not_before(monkeypatch):
@@ -573,6 +593,10 @@ def test_a_plot_names_the_observations_as_the_environment_does():
     assert observation_names(env, 2) == ["observation 0", "observation 1"]
     env.observation_names = ("position", "speed")
     assert observation_names(env, 2) == ["position", "speed"]
+    env.observation_names = ("a $x^$ b", r"$\theta$")  # no formula, and one: both are drawn
+    states = np.array([[0.0, 1.0], [1.0, 0.0]])
+    (film,) = draw_plots(env, [Trajectory(states, np.zeros((1, 1)), np.zeros(1))], lambda number: np.arange(number))
+    assert len(film) == 2
     env.observation_names = ("position",)
     assert observation_names(env, 2) == ["observation 0", "observation 1"]
 

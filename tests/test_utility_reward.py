@@ -98,6 +98,10 @@ def test_other_spaces_and_runs_without_an_estimate_are_refused(pendulum, tmp_pat
         UtilityReward(gymnasium.make("CartPole-v1"), pendulum)
     with pytest.raises(ValueError, match=r"^env: expected an environment, got 'Pendulum-v1'"):
         UtilityReward("Pendulum-v1", pendulum)
+    with pytest.raises(ValueError, match=r"^run: expected a run, as bayespbrl.load reads it, got Learner"):
+        UtilityReward(gymnasium.make("Pendulum-v1"), pendulum.learner)
+    with pytest.raises(ValueError, match=r"^caution: expected a finite number"):
+        UtilityReward(gymnasium.make("Pendulum-v1"), pendulum, caution=[1.0, 2.0])
     bayespbrl.start("Pendulum-v1", tmp_path / "new", **FAST).ask()
     with pytest.raises(ValueError, match="run: expected a run with an estimate of the utility of states, got none yet"):
         UtilityReward(gymnasium.make("Pendulum-v1"), bayespbrl.load(tmp_path / "new"))

@@ -161,10 +161,10 @@ function caption(clip, name) {
 }
 
 // What the learner says about the question, without a hint at either side.
-function learnerText({ worth, sure, advice, notice }) {
+function learnerText({ worth, sure, advice, notice, most }) {
   const parts = [];
   if (sure !== null && sure !== undefined) parts.push(`The learner is ${Math.round(100 * sure)} % sure what you will say.`);
-  if (worth !== null && worth !== undefined) parts.push(`Your answer is worth about ${worth.toFixed(2)} bit, of 1 at most.`);
+  if (worth !== null && worth !== undefined) parts.push(`Your answer is worth about ${worth.toFixed(2)} bit, of ${most ? most.toFixed(1) : 1} at most.`);
   if (advice) parts.push(advice);
   return [parts.join(" "), notice].filter(Boolean).join("\n");
 }
@@ -222,9 +222,9 @@ function render({ model, el }) {
       return;
     }
     if (loaded !== view.turn) {
-      const load = ++loads;
+      const load = ++loads, turn = view.turn;
       const sheets = await Promise.all(["first", "second"].map((name) => createImageBitmap(new Blob([bytes(model.get(name))]))));
-      if (load !== loads || !alive) return;
+      if (load !== loads || !alive || view.turn !== turn || view.phase !== "question") return; // another view came meanwhile
       film.load(view.clips, sheets, view.rate);
       loaded = view.turn;
       shown = performance.now();
@@ -327,8 +327,8 @@ function render({ model, el }) {
 
   (function paint(now) {
     if (!alive) return;
-    film.tick(now);
     requestAnimationFrame(paint);
+    film.tick(now);
   })(performance.now());
   model.on("change:view", take);
   model.on("msg:custom", hear);

@@ -46,6 +46,17 @@ def observation_names(environment: gymnasium.Env, number: int) -> list[str]:
     return ["observation"] if number == 1 else [f"observation {place}" for place in range(number)]
 
 
+def _is_math(name: str) -> bool:
+    """Whether Matplotlib can draw a name with `$` as a formula; where it cannot, the `$` are drawn."""
+    from matplotlib.mathtext import MathTextParser
+
+    try:
+        MathTextParser("agg").parse(name)
+    except ValueError:
+        return False
+    return True
+
+
 def _columns(states: np.ndarray) -> np.ndarray:
     return np.asarray(states, float).reshape(len(states), -1)
 
@@ -82,7 +93,7 @@ def _panels(figure: "Figure", table: np.ndarray, limits: np.ndarray, names: Sequ
         margin = 0.08 * (high - low) or 0.5
         axes.plot(values, color=np.array(BLUE) / 255, linewidth=1.8)
         axes.set_ylim(low - margin, high + margin)
-        axes.set_title(name, color=INK, fontsize=9, loc="left", pad=2)
+        axes.set_title(name, color=INK, fontsize=9, loc="left", pad=2, parse_math=_is_math(name))
         _quiet(axes)
     return panels
 

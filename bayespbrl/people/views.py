@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from scipy.special import entr
 
 from bayespbrl import queries, questions
 from bayespbrl.envs.opening import environment_name
@@ -75,13 +77,33 @@ def said_of(query: Query, state: LearnerState) -> tuple[View, tuple[Answer, ...]
         first = float(prob(likelihood, margins).mean())
         worth = queries.expected_information(draws[:, :1], draws[:, 1:], likelihood=likelihood)
         said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
+        thresholds = state.estimate.tie_thresholds(queries.QUERY_DRAWS)
+        if thresholds is not None:
+            said |= _said_with_ties(chances_with_ties(margins, likelihood, thresholds))
         if said["worth"] < LITTLE:
             said["advice"] = (
                 f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
             )
         likely = UNKNOWN if first >= 0.5 else (Answer.SECOND, Answer.FIRST, *UNKNOWN[2:])
-        likely = with_ties(likely, margins, likelihood, state.estimate.tie_thresholds(queries.QUERY_DRAWS))
+        likely = with_ties(likely, margins, likelihood, thresholds)
     return said, likely
+
+
+def chances_with_ties(
+    margins: Float[np.ndarray, "s 1"], likelihood: Likelihood, thresholds: np.ndarray
+) -> Float[np.ndarray, "3 s"]:
+    """Probability of "first", "second" and "no difference" at each posterior draw."""
+    likelihood = with_threshold(likelihood, thresholds, np.zeros(1, dtype=bool))
+    first, second = (np.ravel(prob(likelihood, sign * margins)) for sign in (1, -1))
+    return np.stack([first, second, np.maximum(1 - first - second, 0.0)])
+
+
+def _said_with_ties(chances: Float[np.ndarray, "3 s"]) -> View:
+    """How sure the learner is of one of three answers, and the bits that one tells, of so many at most."""
+    mean = chances.mean(axis=1)
+    # Houlsby et al. (2011), eq. 2, of three answers
+    worth = max(0.0, float(entr(mean).sum() - entr(chances).sum(axis=0).mean()))
+    return {"sure": float(mean.max()), "worth": worth / np.log(2), "most": np.log2(3)}
 
 
 def with_ties(
@@ -96,9 +118,8 @@ def with_ties(
     """
     if thresholds is None:
         return likely
-    likelihood = with_threshold(likelihood, thresholds, np.zeros(1, dtype=bool))
-    first, second = (float(prob(likelihood, sign * margins).mean()) for sign in (1, -1))
-    chances = {Answer.FIRST: first, Answer.SECOND: second, Answer.TIE: 1 - first - second}
+    mean = chances_with_ties(margins, likelihood, thresholds).mean(axis=1)
+    chances = dict(zip((Answer.FIRST, Answer.SECOND, Answer.TIE), mean, strict=True))
     ordered = sorted(chances, key=lambda answer: -chances[answer])
     return (*ordered[:2], Answer.SKIP, ordered[2])
 

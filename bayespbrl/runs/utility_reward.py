@@ -25,14 +25,16 @@ class UtilityReward(gymnasium.Wrapper):
       caution: c of the reward mean − c · standard deviation; a negative one rewards what is unknown.
 
     Raises:
-      ValueError: no environment; a run without an estimate of the utility, as before its first answers or with the
-        known reward; another observation or action space than the run's; caution without a posterior.
+      ValueError: no environment or no run; a run without an estimate of the utility, as before its first answers or
+        with the known reward; another observation or action space than the run's; caution without a posterior.
     """
 
     def __init__(self, env: gymnasium.Env, run: Run, *, caution: float = 0.0):
         if not isinstance(env, gymnasium.Env):
             raise ValueError(f"env: expected an environment, got {checks.one_line(env)!r}")
         super().__init__(env)
+        if not isinstance(run, Run):
+            raise ValueError(f"run: expected a run, as bayespbrl.load reads it, got {type(run).__name__}")
         estimate = run.estimate
         if estimate is None or estimate.features is None:
             kind = "none yet" if estimate is None else type(estimate).__name__
@@ -41,8 +43,7 @@ class UtilityReward(gymnasium.Wrapper):
         for name in ("observation_space", "action_space"):
             if getattr(env, name) != getattr(given, name):
                 raise ValueError(f"{name}: expected {getattr(given, name)}, the run's, got {getattr(env, name)}")
-        checks.finite("caution", caution)
-        self.caution = float(caution)
+        self.caution = checks.number("caution", caution)
         if self.caution and estimate.posterior is None:
             raise ValueError(f"caution: expected 0 for an estimate without a posterior, got {self.caution:g}")
         # thinned once: where they are indexed the draws would be, at each step

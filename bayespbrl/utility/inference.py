@@ -107,8 +107,9 @@ def infer_utility(
       ties: pairs that were answered with "no difference". There are K pairs and ties in all.
       shown_first: 1 where the first of the pair was shown first, −1 where the second was, 0 where nothing is known,
         shape (K,), for the pairs and then the ties: a side bias is inferred. None: there is none.
-      answerers: who gave each answer, names or numbers from 0, in the same order: each has a lapse rate and, with
-        `shown_first`, a side bias. `posterior["posterior"]["lapse_rate"].sel(answerer="Ada")` are the draws of one.
+      answerers: who gave each answer, names or numbers from 0 (the names are then "0", "1", …), in the same order:
+        each has a lapse rate and, with `shown_first`, a side bias. `posterior["posterior"]["lapse_rate"].sel(
+        answerer="Ada")` are the draws of one.
       features: φ, where utilities of single states are wanted too; None: the rows themselves.
       method: `posterior-mean`; `most-likely`; `posterior-draw`, one draw picked by `seed`, with directions that the
         answers do not touch at their mean, zero; or `linear-program`, which leaves ties out.
