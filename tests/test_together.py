@@ -3,6 +3,7 @@
 import json
 import shutil
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 from test_page import KEYS, answers_of, call, next_turn, served, tab, turn_of
@@ -11,6 +12,7 @@ from toys import QUICK, fingerprint
 import bayespbrl
 from bayespbrl.cli.commands import main
 from bayespbrl.diagnostics import people
+from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session
 from bayespbrl.people.views import FAILED, FINISHED, QUESTION, WAITING
@@ -295,6 +297,21 @@ def test_a_run_ends_though_a_repeat_waits_for_somebody_who_has_left(repeat_waits
     assert number not in answered
     assert number in waiting
     assert bayespbrl.load(directory).learner.finished
+
+
+def test_nobody_is_shown_a_repeat_that_was_left_open_once_the_budget_is_spent(repeat_waits):
+    directory, number = repeat_waits
+    learner = bayespbrl.resume(directory)
+    given, settings = learner.preferences.answers, learner.cycle.settings
+
+    def shown_to(budget):
+        cycle = replace(
+            learner.cycle, settings=replace(settings, questions=replace(settings.questions, answers=budget))
+        )
+        return Foresight(cycle, learner.state, lambda state, query: None, ["Ada", "Ben"], several=True).present.holders
+
+    assert shown_to(given + 1) == {number: "Ada"}
+    assert shown_to(given) == {}
 
 
 def test_a_person_at_the_terminal_is_not_asked_a_repeat_that_waits_for_another(repeat_waits):

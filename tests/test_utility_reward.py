@@ -50,7 +50,7 @@ def test_caution_subtracts_standard_deviations(pendulum):
     _, more, *_ = careless.step(np.array([1.0], np.float32))
     _, less, *_, info = careful.step(np.array([1.0], np.float32))
     assert less == pytest.approx(more - 2 * info["utility_deviation"])
-    with pytest.raises(ValueError, match="caution: expected finite"):
+    with pytest.raises(ValueError, match="caution: expected a finite number"):
         UtilityReward(gymnasium.make("Pendulum-v1"), pendulum, caution=float("nan"))
 
 

@@ -146,10 +146,11 @@ class Foresight:
     def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
         """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.
 
-        A repeated question is left to those who may answer it.
+        A repeated question is left to those who may answer it. Once the budget is spent nobody looks at any: one that
+        somebody has left open stays open.
         """
         settings = self.cycle.settings
-        if state.finished(settings):
+        if state.finished(settings) or settings.questions.left(state.preferences.answers) <= 0:
             return {}
         waiting = {query.number: query for query in state.open}
         holders = {number: who for number, who in before.items() if number in waiting and who in self.people}
