@@ -3,7 +3,6 @@
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from bayespbrl.diagnostics.report.contents import read_contents
@@ -64,7 +63,6 @@ def _predicted(run: Path) -> tuple[list[tuple[int, int, float, bool]], str]:
     contents = read_contents(run)
     answers = [
         (answer.question, answer.iteration, answer.predicted, answer.answer is Answer.FIRST)
-        for answer in contents.answers
-        if answer.iteration > 1 and answer.row is not None and np.isfinite(answer.predicted)
+        for answer in contents.scored
     ]
     return answers, " ".join(warning.what for warning in contents.damage)

@@ -99,6 +99,11 @@ class RunContents:
         return None if self.estimate is None else self.estimate.posterior
 
     @property
+    def scored(self) -> list[AnsweredQuestion]:
+        """The answers that a posterior predicted: none without an order, and none of the first iteration."""
+        return [a for a in self.answers if a.iteration > 1 and a.row is not None and np.isfinite(a.predicted)]
+
+    @property
     def without_posterior(self) -> bool:
         """Whether the run's estimation method has no posterior."""
         return self.settings.estimation.utility in WITHOUT_POSTERIOR

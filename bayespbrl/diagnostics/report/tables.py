@@ -118,9 +118,8 @@ def prequential_table(contents: RunContents) -> xr.Dataset:
     As of `score_predictions`, without ties, skips, answers that could not be predicted, and those of the first
     iteration, which has no posterior.
     """
-    scored = [a for a in contents.answers if a.iteration > 1 and a.row is not None and np.isfinite(a.predicted)]
-    predicted = np.array([answer.predicted for answer in scored])
-    observed = np.array([answer.answer is Answer.FIRST for answer in scored], dtype=bool)
+    predicted = np.array([answer.predicted for answer in contents.scored])
+    observed = np.array([answer.answer is Answer.FIRST for answer in contents.scored], dtype=bool)
     return score_predictions(np.clip(predicted, 0, 1), observed)
 
 

@@ -136,10 +136,12 @@ def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWa
         mistakes = (
             "nothing is wrong" if contents.without_posterior else "the lapse rate allows for them, unless it is set"
         )
-        cause = "the features cannot express what matters: use features of your own, or more centres where states are "
-        cause += "continuous."
-        if contents.settings.estimation.utility == "known-reward":
-            cause = "the expert wants something else than the reward."
+        cause = (
+            "the expert wants something else than the reward."
+            if contents.settings.estimation.utility == "known-reward"
+            else "the features cannot express what matters: use features of your own, or more centres where states are "
+            "continuous."
+        )
         yield ReportWarning(
             f"The estimate contradicts {count(against.size, 'answer')}: {_list(against)}.",
             f"See the pictures below. If these answers are mistakes, {mistakes}. If they are right, {cause}",
