@@ -283,20 +283,32 @@ def broken_stream(page):
     return break_off, back, tried
 
 
-def frozen_clock(opened):
-    """The clock of a tab stands still, so that on a busy machine no time passes until the test wants it to."""
-    opened.add_init_script("performance.running = performance.now; performance.now = () => 0")
+@contextmanager
+def tab_without_views(browser, page, break_off, rate=1):
+    """A tab that shows a question and hears no more, whose clock stood still until then: a busy machine may take long.
+
+    Then the clock jumps by a second, past the moment in which a new question takes no answer, and runs at `rate`.
+    """
+
+    def before(opened):
+        opened.add_init_script("performance.running = performance.now; performance.now = () => 0")
+        opened.route("**/events", break_off)
+
+    with tab(browser, page, before=before) as opened:
+        opened.evaluate(
+            """(rate) => {
+              const start = performance.running();
+              performance.now = () => 1000 + rate * (performance.running() - start);
+            }""",
+            rate,
+        )
+        yield opened
 
 
 def test_a_page_that_hears_no_more_views_says_so_and_goes_on_when_it_hears_them_again(browser, gridworld):
     gridworld.session.wait(timeout=60)
     break_off, back, tried = broken_stream(gridworld)
-
-    def before(opened):
-        frozen_clock(opened)
-        opened.route("**/events", break_off)
-
-    with tab(browser, gridworld, before=before) as opened:
+    with tab_without_views(browser, gridworld, break_off) as opened:
         opened.wait_for_selector(".bp-note >> text=The connection is lost. Trying again…")
         until(opened, lambda: len(tried) >= 3)
         back.set()
@@ -308,13 +320,7 @@ def test_a_page_that_hears_no_more_views_says_so_and_goes_on_when_it_hears_them_
 def test_a_page_that_is_not_answered_for_long_says_what_to_do_and_goes_on_when_it_is(browser, gridworld):
     gridworld.session.wait(timeout=60)
     break_off, back, _ = broken_stream(gridworld)
-
-    def before(opened):
-        frozen_clock(opened)
-        opened.route("**/events", break_off)
-
-    with tab(browser, gridworld, before=before) as opened:
-        opened.evaluate("performance.now = () => 20 * performance.running()")
+    with tab_without_views(browser, gridworld, break_off, rate=20) as opened:
         opened.wait_for_selector(".bp-note >> text=start it again")
         assert opened.get_attribute(".bp-box", "data-locked") == "true"
         opened.keyboard.press("ArrowLeft")
