@@ -664,6 +664,15 @@ def test_a_run_whose_answers_were_all_ties_has_a_report(tmp_path):
     assert "2 of 2 answers were ties" in text
 
 
+@pytest.mark.parametrize(("answers", "skipped"), [(("first", "skip", "first"), ""), (("skip",) * 3, "3 of 3")])
+def test_a_run_whose_questions_were_mostly_skipped_is_told_so(tmp_path, answers, skipped):
+    learner = start(tmp_path / "run", iterations=3)
+    for answer in answers:
+        learner.tell([answer] * len(learner.ask()))
+    text = read(write_report(tmp_path / "run")).text
+    assert (f"{skipped} questions were skipped: they taught nothing." in text) == bool(skipped)
+
+
 @pytest.mark.slow
 def test_features_of_the_users_are_asked_for_and_used_when_passed(tmp_path):
     def own(states):

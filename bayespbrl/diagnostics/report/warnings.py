@@ -153,10 +153,20 @@ def _of_answers(contents: RunContents, answers: xr.Dataset) -> Iterator[ReportWa
             "Some surprises are expected: one in ten predictions of 0.9 fails. The pictures show whether these "
             "answers were mistakes.",
         )
-    ties = sum(answer.answer is Answer.TIE for answer in contents.answers)
-    if ties > 0.3 * max(3, len(contents.answers)):
+    yield from _of_undecided_answers([answer.answer for answer in contents.answers])
+
+
+def _of_undecided_answers(answers: Sequence[Answer]) -> Iterator[ReportWarning]:
+    """Whether many answers were ties or skips."""
+    if (skipped := answers.count(Answer.SKIP)) > 0.5 * max(3, len(answers)):
         yield ReportWarning(
-            f"{ties} of {len(contents.answers)} answers were ties: they say that two are alike, not what is better.",
+            f"{skipped} of {len(answers)} questions were skipped: they taught nothing.",
+            "Say what to look for, or show clips in which it can be seen: shorter ones (--clip-steps), or pictures of your "
+            "own environment's render().",
+        )
+    if (ties := answers.count(Answer.TIE)) > 0.3 * max(3, len(answers)):
+        yield ReportWarning(
+            f"{ties} of {len(answers)} answers were ties: they say that two are alike, not what is better.",
             "Harmless where the trajectories are good. Otherwise longer ones, or less similar ones, are easier to tell "
             "apart.",
         )
