@@ -398,6 +398,8 @@ def test_the_posterior_finds_the_length_scale_that_ordered_the_pairs():
         ({"differences": np.ones((0, 2, 3))}, "differences: expected shape"),
         ({"differences": [[1.0], [1.0, 2.0]]}, "differences: expected rows of numbers"),
         ({"differences": "abc"}, "differences: expected rows of numbers"),
+        ({"differences": [[1e50], [-1.0]]}, r"differences: expected the largest between 1e-30 and 1e\+30, got 1e\+50"),
+        ({"differences": [[-1e-50]]}, "differences: expected the largest between .* got 1e-50; divide"),
         ({"differences": {1: 2}}, "differences: expected rows of numbers"),
         ({"indifferent": np.array([True]), "tie_threshold": 0.1}, "indifferent: expected"),
         ({"tie_threshold": 0.0}, "tie_threshold: expected"),

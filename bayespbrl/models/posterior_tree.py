@@ -20,6 +20,7 @@ from bayespbrl.models.priors import SIDE_BIAS_SCALE
 from bayespbrl.models.threads import one_blas_thread
 
 SAMPLE = ("chain", "draw")
+LARGEST_DIFFERENCE = 1e30  # and its inverse the smallest: their fourth powers must be numbers
 SAME_MARGINS = 1e-6  # relative to the largest: rounding on one machine, in another's coordinates the error is near 1
 
 
@@ -34,6 +35,12 @@ def settings_of(differences: ArrayLike) -> Float[np.ndarray, "s k d"]:
     checks.finite("differences", array)
     if not array.shape[0] or not array.shape[2]:
         raise ValueError(f"differences: expected shape (K, D >= 1) or (C, K, D), got {np.shape(differences)}")
+    largest = float(np.max(np.abs(array), initial=0.0))
+    if largest and not 1 / LARGEST_DIFFERENCE <= largest <= LARGEST_DIFFERENCE:
+        raise ValueError(
+            f"differences: expected the largest between {1 / LARGEST_DIFFERENCE:g} and {LARGEST_DIFFERENCE:g}, got "
+            f"{largest:g}; divide them by their root mean square length"
+        )
     return array
 
 

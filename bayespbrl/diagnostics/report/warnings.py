@@ -161,8 +161,8 @@ def _of_undecided_answers(answers: Sequence[Answer]) -> Iterator[ReportWarning]:
     if (skipped := answers.count(Answer.SKIP)) > 0.5 * max(3, len(answers)):
         yield ReportWarning(
             f"{skipped} of {len(answers)} questions were skipped: they taught nothing.",
-            "Say what to look for, or show clips in which it can be seen: shorter ones (--clip-steps), or pictures by your "
-            "environment's render().",
+            "Say what to look for, or show clips in which it can be seen: shorter ones (--clip-steps), or pictures by "
+            "your environment's render().",
         )
     if (ties := answers.count(Answer.TIE)) > 0.3 * max(3, len(answers)):
         yield ReportWarning(
