@@ -111,14 +111,14 @@ def test_pf_learns_from_the_answers_and_not_without_them(monkeypatch):
     contrary = [value(lambda a, b: ReturnExpert()(b, a), seed) for seed in (1, 2, 3)]
     assert np.median(honest) > 0.4 > 0.1 > np.median(contrary)
     assert value(ReturnExpert(), 1) == honest[0]
-    assert next(programming_by_feedback(environment, lambda a, b: "tie", answers=1, seed=1)).pairs == 0
+    assert next(programming_by_feedback("gridworld", lambda a, b: "tie", answers=1, seed=1)).pairs == 0
 
 
 def test_baselines_refuse_tasks_that_are_not_theirs():
     with pytest.raises(ValueError, match="baseline pf: expected a task with a known transition_table"):
-        next(programming_by_feedback(open_environment("swing-up"), ReturnExpert(), answers=1, seed=0))
+        next(programming_by_feedback("swing-up", ReturnExpert(), answers=1, seed=0))
     with pytest.raises(ValueError, match="baseline epmc: expected observations in a bounded Box"):
-        next(every_visit_preferences(open_environment("gridworld"), ReturnExpert(), answers=1, seed=0))
+        next(every_visit_preferences("gridworld", ReturnExpert(), answers=1, seed=0))
     twelve = Push(1)
     twelve.observation_space = gymnasium.spaces.Box(-1, 1, (12,))  # two billion cells
     with pytest.raises(ValueError, match="observations of at most 8 dimensions, as each has 6 cells, got 12"):

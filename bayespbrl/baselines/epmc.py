@@ -32,6 +32,7 @@ from jaxtyping import Float, Int, Key
 
 from bayespbrl import rollouts
 from bayespbrl.baselines.steps import Step
+from bayespbrl.envs.opening import AnyEnvironment, open_environment
 from bayespbrl.experts import Expert
 from bayespbrl.policies.policy import AnyArray
 from bayespbrl.preferences import Answer, parse_answer
@@ -43,12 +44,12 @@ EXPLORATION = 0.1  # η of EXP3
 
 
 def every_visit_preferences(
-    environment: gymnasium.Env, expert: Expert, *, answers: int, seed: int, max_steps: int | None = None
+    environment: AnyEnvironment, expert: Expert, *, answers: int, seed: int, max_steps: int | None = None
 ) -> Iterator[Step]:
     """Ask `answers` questions; yields a step with a `GridPolicy` after each.
 
     Args:
-      environment: observations in a bounded `Box`, actions in a bounded `Box` of one dimension.
+      environment: as of `Learner`; observations in a bounded `Box`, actions in a bounded `Box` of one dimension.
       expert: answers.
       answers: how many, each on two new trajectories.
       seed: of everything random.
@@ -57,6 +58,7 @@ def every_visit_preferences(
     Raises:
       ValueError: other spaces.
     """
+    environment = open_environment(environment)
     policy = GridPolicy.initial(environment)
     cells, actions = np.asarray(policy.table).shape
     better = np.full((cells, actions, actions), 0.5)  # P(a ≻ a′ | s)

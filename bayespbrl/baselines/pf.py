@@ -20,7 +20,6 @@ Decisions, where the sources are silent or differ:
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import gymnasium
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,6 +27,7 @@ from scipy.special import xlogy
 
 from bayespbrl import rollouts
 from bayespbrl.baselines.steps import Step
+from bayespbrl.envs.opening import AnyEnvironment, open_environment
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.experts import Expert
 from bayespbrl.policies import TabularPolicy
@@ -39,12 +39,12 @@ DRAWS, MOVES = 300, 40  # of the posterior, and elliptical slices between two an
 
 
 def programming_by_feedback(
-    environment: gymnasium.Env, expert: Expert, *, answers: int, seed: int, max_steps: int | None = None
+    environment: AnyEnvironment, expert: Expert, *, answers: int, seed: int, max_steps: int | None = None
 ) -> Iterator[Step]:
     """Ask `answers` questions; yields a step with a `TabularPolicy` after each.
 
     Args:
-      environment: its dynamics have a `transition_table`, P(s′ | s, a) of shape (S, A, S).
+      environment: as of `Learner`; its dynamics have a `transition_table`, P(s′ | s, a) of shape (S, A, S).
       expert: answers.
       answers: how many.
       seed: of everything random.
@@ -53,6 +53,7 @@ def programming_by_feedback(
     Raises:
       ValueError: an environment whose transition probabilities are not known.
     """
+    environment = open_environment(environment)
     dynamics: Any = getattr(environment.unwrapped, "dynamics", None)
     if not hasattr(dynamics, "transition_table"):
         raise ValueError(f"baseline pf: expected a task with a known transition_table, got {environment}")
