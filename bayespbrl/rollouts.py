@@ -133,7 +133,8 @@ def reset_seed(key: Key[Array, ""]) -> int:
 
     The other episodes' count up from it, but for environments with a vector version of their own.
     """
-    return int(jax.random.randint(jax.random.split(key)[0], (), 0, 2**30))
+    with jax.enable_x64(False):  # else the caller's setting would decide
+        return int(jax.random.randint(jax.random.split(key)[0], (), 0, 2**30))
 
 
 def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episodes: int, max_steps: int | None) -> int:
@@ -158,17 +159,17 @@ def _check_actions(
     dynamics: FuncEnv, policy: Sampler, actions: Shaped[np.ndarray, "n t ..."], lengths: Int[np.ndarray, " n"]
 ) -> None:
     """Check the actions that were taken; JAX would take the nearest of a discrete space."""
-    taken = actions[np.arange(actions.shape[1]) < lengths[:, None]]
-    _check_finite(policy, taken)
-    if (outside := outside_of(dynamics.action_space, taken)).any():
-        raise ValueError(
-            f"policy {type(policy).__name__}: expected actions of {dynamics.action_space}, got {taken[outside][0]}"
-        )
+    _check_of_space(policy, dynamics.action_space, actions[np.arange(actions.shape[1]) < lengths[:, None]])
 
 
-def _check_finite(policy: Sampler, actions: Shaped[np.ndarray, "n ..."]) -> None:
+def _check_of_space(policy: Sampler, space: gymnasium.Space[Any], actions: Shaped[np.ndarray, "n ..."]) -> None:
+    """Check actions, one a row; those beyond the bounds of a `Box` are taken at the bounds."""
     if not np.isfinite(actions).all():
         raise ValueError(f"policy {type(policy).__name__}: expected finite actions, got NaN or infinity")
+    fits = np.prod(actions.shape[1:]) == np.prod(space.shape or ())
+    outside = outside_of(space, actions) if fits else np.ones(len(actions), bool)
+    if outside.any():
+        raise ValueError(f"policy {type(policy).__name__}: expected actions of {space}, got {actions[outside][0]}")
 
 
 def _first_not_finite(observations: Shaped[np.ndarray, "n t1 ..."], rewards: Float[np.ndarray, "n t"]) -> int:
@@ -331,7 +332,7 @@ def _by_interface(
     def act(first: int, step: int, observations: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, "n ..."]:
         with jax.enable_x64(True):
             actions = np.asarray(choose(policy, policy_key, first * blocks + step // hold, observations))
-        _check_finite(policy, actions)
+        _check_of_space(policy, env.action_space, actions)
         return actions
 
     time_limit = steps if explicit else None

@@ -13,11 +13,13 @@ DISCOUNT = 0.98  # γ of Q, and of ψ(τ) where no learner says otherwise; the p
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Trajectory:
-    """One trajectory of T steps; lists become arrays. It equals itself alone.
+    """One trajectory of T steps; lists become arrays, which are read-only. It equals itself alone.
 
     Attributes:
-      states: s₀ … s_T as observed; shape (T+1, S) float, or (T+1,) int where observations are discrete.
-      actions: a₀ … a_{T−1}; shape (T, A) float, or (T,) int where actions are discrete.
+      states: s₀ … s_T as the learner observes them; shape (T+1, S) float, or (T+1,) int, counted from 0, where
+        observations are discrete. Of several parts or dimensions they are flattened as gymnasium does, discrete parts
+        one-hot; so are discrete observations where actions are continuous.
+      actions: a₀ … a_{T−1}; shape (T, A) float, or (T,) int, counted from 0, where actions are discrete.
       rewards: the environment's hidden reward of each step. Only experts and evaluation read it.
       terminated: whether s_T is terminal (a time limit is not).
 
@@ -38,8 +40,9 @@ class Trajectory:
                 raise ValueError(f"trajectory: {name}: expected one entry for each step, got {given!r}")
             values = np.asarray(given)
             whole = values.dtype.kind in "iub" and (values.ndim == 2 or name == "rewards")
-            # how a frozen dataclass sets an attribute
-            object.__setattr__(self, name, values.astype(np.float64) if whole else values)
+            kept = values.astype(np.float64) if whole else values.view()
+            kept.flags.writeable = False  # experts, query rules and schedules of the user's see what is learned from
+            object.__setattr__(self, name, kept)  # how a frozen dataclass sets an attribute
         steps = len(self.actions)
         if steps == 0:
             raise ValueError("trajectory: expected at least one step, got none")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.experimental.functional import FuncEnv
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Sequence
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Sequence, Tuple
 from gymnasium.utils.env_checker import check_env
 from matplotlib.figure import Figure
 from PIL import Image
@@ -296,3 +296,26 @@ def test_the_largest_number_as_a_bound_of_actions_stands_for_none(dtype):
     policy = LinearGaussianPolicy.initial(opened.observation_space, opened.action_space)
     (path,) = rollout(env, policy, key=jax.random.key(0), episodes=1, max_steps=5)
     assert 0 < np.abs(path.actions).max() < 10
+
+
+@pytest.mark.parametrize(
+    ("space", "inside", "outside"),
+    [
+        (MultiDiscrete([2, 3]), [1, 2], [2, 0]),
+        (MultiDiscrete([2, 3], start=[5, 0]), [5, 0], [4, 0]),
+        (Dict(a=Discrete(3), b=Discrete(2)), {"a": 2, "b": 0}, {"a": -1, "b": 0}),
+        (Tuple([Discrete(3, start=5), Box(0, 1, (1,))]), (5, np.full(1, 7.0)), (8, np.zeros(1))),
+        (MultiBinary(3), [1, 0, 1], [2, 0, 1]),
+    ],
+)
+def test_discrete_parts_outside_their_space_are_refused_and_not_taken_for_others(space, inside, outside):
+    assert to_plain(space, inside).ndim == 1
+    with pytest.raises(ValueError, match="observation: expected one of"):
+        to_plain(space, outside)
+
+
+def test_bounds_of_half_precision_may_be_wide():
+    class Half(Push):
+        action_space = Box(-1, 1, (1,), dtype=np.float16)
+
+    assert open_environment(Half(3)).action_space.dtype == np.float16

@@ -239,6 +239,15 @@ def test_the_kl_of_the_fitted_table_is_that_of_reps_and_the_bound(kl_bound):
     assert updated.action_standard_deviation is None  # the actions are discrete
 
 
+@pytest.mark.parametrize("kl_bound", [10.0, 1e6])
+def test_a_bound_that_no_policy_reaches_leads_to_a_greedy_one(kl_bound):
+    steps, utilities = random_steps()
+    updated = improve(random_policy(), steps, utilities, kl_bound=kl_bound)
+    assert updated.updates == 1
+    assert not updated.reps.bound_active
+    assert updated.policy.table[np.unique(steps.states)].max(axis=1).min() > 0.99
+
+
 def test_a_constant_utility_changes_nothing():
     steps, _ = random_steps()
     updated = improve(random_policy(), steps, np.full(len(steps), 2.5))

@@ -406,6 +406,16 @@ def test_the_linear_fit_is_weighted_least_squares():
     np.testing.assert_allclose(log_probabilities(policy, observations, actions), expected, rtol=1e-5)
 
 
+def test_the_linear_fit_does_not_depend_on_the_unit_of_observations():
+    rng = np.random.default_rng(20)
+    observations = rng.normal(size=(60, 2))
+    actions = observations + 0.1 * rng.normal(size=(60, 2))
+    plain, small = (initial("linear").fit(unit * observations, actions, np.ones(60)) for unit in (1.0, 1e-15))
+    with jax.enable_x64(True):
+        means = [jax.vmap(policy.mean)(unit * observations) for policy, unit in ((plain, 1.0), (small, 1e-15))]
+    np.testing.assert_allclose(means[1], means[0], atol=1e-6)
+
+
 def test_the_linear_noise_keeps_to_its_floor():
     observations = np.random.default_rng(21).normal(size=(20, 2))
     policy = LinearGaussianPolicy.initial(CONTINUOUS, TORQUES, minimum_noise=0.02)

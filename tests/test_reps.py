@@ -97,6 +97,19 @@ def test_an_unreachable_bound_is_reported_as_inactive_and_the_policy_turns_greed
     assert np.all(conditional[[0, 1], greedy] > 0.99)
 
 
+@pytest.mark.parametrize("kl_bound", [50.0, 1e6])
+def test_a_bound_that_many_samples_do_not_reach_leads_to_a_greedy_step_too(kl_bound):
+    rng = np.random.default_rng(0)
+    states, centres = rng.uniform(-1, 1, (2000, 2)), rng.uniform(-1, 1, (40, 2))
+    features = np.exp(-np.square(states[:, None] - centres).sum(axis=2) / 0.1)
+    q_values = np.sin(3 * states[:, 0]) + rng.normal(size=2000)
+    solution = reps_weights(q_values, features, np.full(2000, 1 / 2000), kl_bound=kl_bound)
+    assert solution.converged
+    assert solution.feature_gap < 0.01  # of a standard deviation
+    best = reps_weights(q_values, features, np.full(2000, 1 / 2000), kl_bound=3.5)
+    assert solution.probabilities @ q_values > best.probabilities @ q_values
+
+
 def test_equal_values_leave_the_policy_as_it_is():
     _, features, base = random_problem()
     solution = reps_weights(np.full(len(base), 4.0), features, base, kl_bound=0.3)

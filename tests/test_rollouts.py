@@ -1,5 +1,6 @@
 """Step 3: compiled rollouts, the gymnasium interface, and what happens when either goes wrong."""
 
+import re
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -638,3 +639,30 @@ def test_a_learner_of_episodes_that_end_at_once_collects_more_of_them():
     learner = bayespbrl.Learner(Push(5, ends=True), max_steps=60)
     assert learner.settings.rollouts.trajectories_per_iteration == 80
     assert bayespbrl.Learner(Push(50), max_steps=60).settings.rollouts.trajectories_per_iteration == 10
+
+
+def test_episodes_begin_alike_whether_or_not_the_program_uses_jax_with_64_bits():
+    seeds = []
+    for wide in (False, True):
+        with jax.enable_x64(wide):
+            seeds.append(rollouts.reset_seed(jax.random.key(5)))
+    assert seeds[0] == seeds[1]
+
+
+@pytest.mark.parametrize(
+    ("environment", "action", "shown"),
+    [
+        ("CartPole-v1", 2, "Discrete(2), got 2"),
+        ("CartPole-v1", -1, "Discrete(2), got -1"),
+        ("gridworld", 1.7, "Discrete(5), got 1.7"),
+        ("gridworld", [1, 2], r"Discrete(5), got [1 2]"),
+        ("bicycle", [1.0], "(2,), float64), got [1.]"),
+    ],
+)
+def test_actions_that_are_none_of_the_space_are_named(environment, action, shown):
+    class Same:
+        def sample(self, key, observation):
+            return np.asarray(action)
+
+    with pytest.raises(ValueError, match=f"^policy Same: expected actions of .*{re.escape(shown)}$"):
+        rollout(environment, Same(), key=jax.random.key(0), episodes=2, max_steps=3)

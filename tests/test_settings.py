@@ -40,7 +40,7 @@ BAD = {
     "evaluation_episodes": [0, NAN],
     "centres": [0, -300, 1.5],
     "update_states": [0, -1, 2.5],
-    "max_steps": [0, -1, True, 10.0],
+    "max_steps": [0, -1, True, 10.0, 10**13],
     "recent_iterations": [0, -4, True, 2.0],
     "updates_per_iteration": [0, -1, True, 1.5, None],
     "unasked_iterations": [-1, True, 1.5, None],

@@ -109,3 +109,12 @@ def test_what_is_no_array_of_numbers_is_refused_by_name(name, bad):
     given = {"states": [[0.0], [1.0]], "actions": [[0.0]], "rewards": [0.0]} | {name: bad}
     with pytest.raises(ValueError, match=f"trajectory: {name}: expected "):
         Trajectory(**given)
+
+
+def test_what_is_learned_from_cannot_be_changed_in_place_and_the_callers_arrays_can():
+    states = np.zeros((3, 2))
+    trajectory = Trajectory(states, [0, 1], np.ones(2))
+    for values in (trajectory.states, trajectory.actions, trajectory.rewards, trajectory.clip(0, 1).states):
+        with pytest.raises(ValueError, match="read-only"):
+            values -= 1
+    states[0, 0] = 5.0

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.experimental.functional import FuncEnv
-from gymnasium.spaces import Box, Discrete, Space, flatten, flatten_space
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple, flatten, flatten_space
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformAction, TransformObservation
 
 from bayespbrl import checks
@@ -114,6 +114,14 @@ def given_by_name(environment: object) -> bool:
         for one in (spec, registered)
     ]
     return named[0].keys() == named[1].keys() and all(_same(named[0][name], named[1][name]) for name in named[0])
+
+
+def identity(environment: object) -> str | None:
+    """gymnasium's id of an environment or of its name; None where the name alone does not open the same one again."""
+    if isinstance(environment, str):
+        return SHORT_NAMES.get(environment, environment).rpartition(":")[2]
+    given = as_given(environment) if isinstance(environment, gymnasium.Env) else environment
+    return (given if isinstance(given, EnvSpec) else given.spec).id if given_by_name(given) else None  # type: ignore[attr-defined]
 
 
 def _same(first: Any, second: Any) -> bool:
@@ -226,7 +234,7 @@ def _bounded(space: Box | Discrete) -> Box | Discrete:
     if isinstance(space, Discrete):
         return space
     bounds = np.array([space.low, space.high])
-    none = np.isfinite(bounds) & (np.abs(bounds) > NO_BOUND)
+    none = np.isfinite(bounds) & (np.abs(bounds.astype(np.float64)) > NO_BOUND)
     if not none.any():
         return space
     low, high = np.where(none, np.copysign(np.inf, bounds), bounds)
@@ -260,9 +268,27 @@ def to_plain(
     if isinstance(space, Box):
         return np.reshape(value, -1)
     try:
-        return np.asarray(flatten(space, value), np.float64)
+        if _parts_within(space, value):
+            return np.asarray(flatten(space, value), np.float64)
+        why = None
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}") from error
+        why = error
+    raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}") from why
+
+
+def _parts_within(space: Any, value: Any) -> bool:
+    """Whether the discrete parts of an observation are of their spaces: gymnasium takes others for some that are."""
+    if isinstance(space, Dict):
+        return all(_parts_within(part, value[name]) for name, part in space.spaces.items())
+    if isinstance(space, Tuple):
+        return all(map(_parts_within, space.spaces, value))
+    values = np.asarray(value)
+    if isinstance(space, MultiBinary):
+        return bool(np.all((values == 0) | (values == 1)))
+    if isinstance(space, Discrete | MultiDiscrete):
+        number = space.n if isinstance(space, Discrete) else space.nvec
+        return bool(np.all((values >= space.start) & (values < space.start + number)))
+    return True
 
 
 def given_to_plain(space: gymnasium.Space[Any], value: Any, actions: gymnasium.Space[Any]) -> np.ndarray | np.int64:
@@ -274,8 +300,9 @@ def given_to_plain(space: gymnasium.Space[Any], value: Any, actions: gymnasium.S
 
 def _check_number(space: Discrete, value: Any, *, within: bool = True) -> None:
     """Check that `value` is a whole number, and one of `space` unless that is looked at elsewhere."""
-    outside = within and not space.start <= value < space.start + space.n
-    if outside or not np.isfinite(value) or value != int(value):
+    number = np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"
+    outside = number and within and not space.start <= value < space.start + space.n
+    if not number or outside or not np.isfinite(value) or value != int(value):
         raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
 
 

@@ -234,10 +234,10 @@ def _checked(env: gymnasium.Env, where: str, observations: Rows, *rewards: Rows)
 
 
 def outside_of(space: gymnasium.Space[Any], observations: Rows) -> Bool[np.ndarray, "..."]:
-    """Which observations are none of a `Discrete` space that counts from 0; the bounds of a `Box` are not looked at."""
+    """Which are none of a `Discrete` space that counts from 0; the bounds of a `Box` are not looked at."""
     if not isinstance(space, Discrete):
         return np.zeros(len(observations), bool)
-    return (observations < 0) | (observations >= space.n)
+    return (observations < 0) | (observations >= space.n) | (observations != np.floor(observations))
 
 
 @contextmanager

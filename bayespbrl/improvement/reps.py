@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 from bayespbrl import checks
 
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
+HIGHER_FLOORS = (1e-2, 1e-1)  # where the solver does not finish near the floor
 RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
 CONSTANT = "constant Q: nothing to gain"
@@ -279,7 +280,11 @@ def _checked_samples(
 def _solve_dual(
     q_values: PerSample, features: Float[np.ndarray, "n r"], base_weights: PerSample, kl_bound: float
 ) -> tuple[float, Float[np.ndarray, " r"], bool, str]:
-    """Minimise g(η, v) = ηε + η log Σ Wᵢ exp((Qᵢ − vᵀφᵢ)/η) (eq. 13 with φ̂ = 0) over η ≥ floor and v."""
+    """Minimise g(η, v) = ηε + η log Σ Wᵢ exp((Qᵢ − vᵀφᵢ)/η) (eq. 13 with φ̂ = 0) over η ≥ floor and v.
+
+    Near the floor, where a large bound leads, g is nearly a maximum of linear functions, and the solver may not finish.
+    A higher floor then takes nearly as greedy a step.
+    """
     rank = features.shape[1]
     unknown: Any = ca.MX.sym("eta_and_v", 1 + rank)
     eta = unknown[0]
@@ -299,8 +304,11 @@ def _solve_dual(
     }
     problem: Any = {"x": unknown, "f": dual}
     solver = ca.nlpsol("reps_dual", "ipopt", problem, options)
-    lower = np.concatenate([[TEMPERATURE_FLOOR], np.full(rank, -np.inf)])
     start = np.concatenate([[1.0], np.zeros(rank)])
-    solution = np.asarray(solver(x0=start, lbx=lower, ubx=np.inf)["x"]).ravel()
-    statistics = solver.stats()
+    for floor in (TEMPERATURE_FLOOR, *HIGHER_FLOORS):
+        lower = np.concatenate([[floor], np.full(rank, -np.inf)])
+        solution = np.asarray(solver(x0=start, lbx=lower, ubx=np.inf)["x"]).ravel()
+        statistics = solver.stats()
+        if statistics["success"] or solution[0] > 2 * floor:
+            break
     return float(solution[0]), solution[1:], bool(statistics["success"]), str(statistics["return_status"])

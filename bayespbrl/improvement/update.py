@@ -28,7 +28,7 @@ from bayespbrl.policies import Policy, clipped, entropies, is_discrete, sample_a
 from bayespbrl.policies.policy import ContinuousPolicy, DiscretePolicy, fit_converged
 
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
-NOTHING = 1e-3  # of the bound; weights that have moved by less have nothing to gain
+NOTHING = 1e-3  # of the bound, or of a nat where it is larger; weights that have moved by less have nothing to gain
 MOST_CONSTRAINED = 0.25  # features of the constraint on the state distribution, of the samples
 
 
@@ -240,7 +240,7 @@ def apply_update(
         if number:
             proposed = propose(improved, proposed.problem, key=jax.random.fold_in(key, number))
         reps = proposed.solve(kl_bound)
-        if reps.kl < NOTHING * kl_bound or not reps.converged:
+        if reps.kl < NOTHING * min(kl_bound, 1.0) or not reps.converged:
             break
         fit = getattr(improved, "fit_mean" if number and hasattr(type(improved), "fit_mean") else "fit")
         improved = fit(*proposed.samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)  # eq. 14

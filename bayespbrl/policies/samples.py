@@ -56,7 +56,7 @@ def location_and_deviation(
     """Weighted mean and standard deviation of each dimension; zero where it is constant but for rounding."""
     location = shares @ observations
     deviation = np.sqrt(shares @ np.square(observations - location))
-    return location, np.where(deviation > 1e-12 * (1 + np.abs(location)), deviation, 0.0)
+    return location, np.where(deviation > 1e-12 * np.abs(observations).max(axis=0), deviation, 0.0)
 
 
 def _checked_weights(name: str, weights: ArrayLike, number: int) -> Float[np.ndarray, " n"]:

@@ -9,12 +9,13 @@ import jax
 import numpy as np
 import xarray as xr
 
-from bayespbrl import rollouts
+from bayespbrl import checks, rollouts
 from bayespbrl.envs.opening import (
     AnyEnvironment,
     check_of_space,
     from_plain,
     given_to_plain,
+    identity,
     imported_by_name,
     made_again,
 )
@@ -129,6 +130,8 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
             raise ValueError(f"{log.path}: expected {expected}, got {given!r}")
     if settings.environment == "other" and env is None:
         raise ValueError(f"{log.path}: expected env= again, which the run was started with, got None")
+    if settings.environment != "other" and env is not None and identity(env) != identity(settings.env):
+        raise ValueError(f"{log.path}: expected no env=, or {settings.env}, which the run was started with, got {env}")
     summarised, policy = log.summarised(), own["policy"]
     entries = log.entries(features=own["features"], known=() if policy is None else classes_of(policy))
     try:
@@ -231,7 +234,7 @@ class Run:
             rollouts.returns(
                 learner.environment,
                 learner.policy,
-                key=jax.random.key(seed),
+                key=jax.random.key(checks.seed(seed)),
                 episodes=episodes,
                 max_steps=learner.settings.rollouts.max_steps,
             ).total.mean()

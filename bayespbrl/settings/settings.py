@@ -28,6 +28,7 @@ from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 LAST_ITERATIONS = 5  # after the last answer: the policy catches up with what is known
 INFERRED: dict[str, Any] = {"steepness": None, "lapse_rate": None}  # unless they or all hyperparameters are given
 MOST_UNASKED = 10  # in a row; then more answers would change little
+MOST_STEPS = 10_000_000  # an episode
 MOST_TRAJECTORIES = 100_000  # an iteration; of a damaged or foreign run, they are room that is made
 
 
@@ -110,6 +111,8 @@ class Rollouts:
         if number > MOST_TRAJECTORIES:
             raise ValueError(f"trajectories_per_iteration: expected at most {MOST_TRAJECTORIES}, got {number}")
         checks.optional(checks.whole, "max_steps", self.max_steps)
+        if self.max_steps is not None and self.max_steps > MOST_STEPS:
+            raise ValueError(f"max_steps: expected at most {MOST_STEPS}, got {self.max_steps}")
         checks.optional(checks.whole, "exploration_hold", self.exploration_hold)
         checks.whole("evaluation_episodes", self.evaluation_episodes)
         checks.one_of("policy", self.policy, ("auto", *POLICIES, "other"))

@@ -74,6 +74,7 @@ def run_trials(
     """
     if not isinstance(seeds, range) or seeds.step != 1 or not seeds:
         raise ValueError(f"seeds: expected a range of consecutive seeds, at least one, got {seeds!r}")
+    checks.seed(seeds[-1])
     row = row_of(env, Path(directory), settings, seed=seeds.start, preference_within=preference_within)
     tried = Seeds(row, len(seeds))
 
