@@ -73,7 +73,8 @@ Env = Annotated[str, typer.Argument(help=f"{', '.join(SHORT_NAMES)}, or any gymn
 
 # The options of a run and of each trial, with their help. One left out has the value of the environment's preset.
 RUN_OPTIONS = {
-    "answers": "Budget: maximum number of answers, ties included (default 20); the iterations follow from it.",
+    "answers": "Budget: maximum number of answers, ties included; by default 20, and the iterations follow from it. "
+    "With --preset paper there is none unless given: the iterations decide.",
     "preset": "default (for any task) or paper (the paper's protocol, with its constant KL bound).",
     "utility": f"Estimate of the utility: {', '.join(METHODS)}. The last is a reference run trained on the hidden "
     "reward.",
@@ -97,15 +98,15 @@ RUN_OPTIONS = {
     "omitted, or 5 with --hyperparameters given.",
     "lapse_rate": "Share of answers modelled as given at random, in [0, 1); inferred if omitted, or 0 with "
     "--hyperparameters given.",
-    "discount": "Discount of Q, in [0, 1); the paper's is 0.98.",
+    "discount": "Discount of Q, in [0, 1); by default by the horizon, within 0.98 and 0.995; the paper's is 0.98.",
     "trajectory_discount": "Discount of the trajectory features, in [0, 1]: 1 by default, because experts judge whole "
-    "trajectories; the paper's is the discount of Q.",
+    "trajectories. The paper's is the discount of Q, which gridworld, bicycle and acrobot have by default too.",
     "wrong_answers": "Share of the simulated expert's answers that are reversed, in [0, 1].",
     "policy": f"Kind of policy: auto, {', '.join(POLICIES)}.",
     "centres": "Number of radial basis functions of each kind of feature.",
     "max_steps": "Maximum steps per episode; the environment's limit if omitted.",
     "repeats": "Share of the questions that repeat an earlier one with sides swapped, to measure how consistent a "
-    "person is; 0.1 for people, 0 for a simulated expert.",
+    "person is; 0.1 for people, 0 for a simulated expert and with --preset paper.",
     "shared_repeats": "Let repeated questions be other people's too, so that the report tells how well people agree.",
     "expert": "Who answers: return (simulated, always right), page (you, in a browser), terminal (you, at the prompt), "
     "or a simulated expert who errs: stochastic, myopic, skipping, equal, mistaken (B-Pref's teachers) or margin "
