@@ -82,9 +82,14 @@ def short_name(name: str, value: Any) -> str:
     return str(value)
 
 
-def dense(values: Any) -> np.ndarray:
-    """`values` as an array, of SciPy's sparse ones too."""
-    return np.asarray(values.toarray() if hasattr(values, "toarray") else values)
+def dense(name: str, values: Any) -> np.ndarray:
+    """`values` as an array, of SciPy's sparse ones too; neither rows of different lengths nor masked entries."""
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name}: expected numbers, got masked entries")
+    try:
+        return np.asarray(values.toarray() if hasattr(values, "toarray") else values)
+    except ValueError as error:
+        raise ValueError(f"{name}: expected rows of numbers, all equally long, got {_shortened(values)}") from error
 
 
 def finite(name: str, values: Any) -> None:

@@ -160,9 +160,10 @@ class StateActionProduct:
 
     def __call__(self, observations: Shaped[np.ndarray, "n ..."], actions: ArrayLike) -> Float[np.ndarray, "n da"]:
         """Features of N pairs."""
-        states = self.state_features(observations)
-        chosen = OneHot(self.number_of_actions)(actions)
-        return (states[:, :, None] * chosen[:, None, :]).reshape(len(states), -1)
+        states, actions = self.state_features(observations), indices("actions", actions, self.number_of_actions)
+        if len(states) != len(actions):
+            raise ValueError(f"actions: expected {len(states)}, one for each state, got {len(actions)}")
+        return (states[:, :, None] * OneHot(self.number_of_actions)(actions)[:, None, :]).reshape(len(states), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,15 +322,13 @@ def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."
     name = getattr(features, "__name__", type(features).__name__)
     if not callable(features):
         raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
-    values = dense(features(np.array(states)))  # a copy, which the function may change
+    values = dense(f"features {name}", features(np.array(states)))  # a copy, which the function may change
     if values.ndim != 2 or len(values) != len(states) or values.shape[1] == 0:
         raise ValueError(f"features {name}: expected shape ({len(states)}, D), got {values.shape}")
     if not (np.issubdtype(values.dtype, np.number) or values.dtype == bool) or np.iscomplexobj(values):
         raise ValueError(f"features {name}: expected real numbers, got {values.dtype}")
-    values = values.astype(np.float64)
-    if not np.isfinite(values).all():
-        row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-        raise ValueError(f"features {name}: expected finite numbers, got NaN or infinity for state {states[row]}")
+    if (bad := ~np.isfinite(values := values.astype(np.float64)).all(axis=1)).any():
+        raise ValueError(f"features {name}: expected finite numbers, got NaN or infinity for state {states[bad][0]}")
     return values
 
 

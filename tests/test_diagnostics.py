@@ -87,6 +87,11 @@ def test_ranks_are_level_where_chains_agree_and_pile_up_where_one_does_not(draws
     assert heights(None)[1, -1] > 3  # the worst by default: the chain that is elsewhere has the highest ranks
 
 
+def test_ranks_are_level_where_all_draws_are_equal():
+    axes = plot_ranks(tree_of(np.zeros((4, 1000, 1))), Figure().subplots(), bins=4)
+    np.testing.assert_allclose([patch.get_data().values for patch in axes.patches], 1.0, atol=0.25)
+
+
 @pytest.mark.parametrize("preference", [-1, 3])
 def test_an_unknown_preference_is_refused(draws, preference):
     with pytest.raises(ValueError, match=r"preference: expected a number in 0 … 2, got -?\d"):

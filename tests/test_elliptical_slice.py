@@ -5,6 +5,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 from arviz_base import from_numpyro
+from numpyro.contrib.control_flow import scan
 from numpyro.infer import MCMC, NUTS, Gibbs
 from scipy import stats
 
@@ -447,3 +448,37 @@ def test_a_subsampled_plate_is_refused():
 
     with pytest.raises(ValueError, match="model: expected whole plates, got 2 of 6 rows in plate 'rows'"):
         run(EllipticalSlice(subsampled), jnp.arange(6.0), num_samples=5)
+
+
+def scanned(prior_of):
+    """Five steps, each with a latent `x` whose prior `prior_of` makes of the step before; their sums are observed."""
+
+    def step(total, _):
+        x = numpyro.sample("x", prior_of(total))
+        return total + x, total + x
+
+    _, sums = scan(step, 0.0, None, length=5)
+    numpyro.sample("y", dist.Normal(sums, 0.5), obs=jnp.arange(1.0, 6.0))
+
+
+@pytest.mark.parametrize("chain_method", ["sequential", "vectorized"])
+def test_steps_of_a_scan_may_not_depend_on_earlier_ones_and_independent_ones_are_sampled_exactly(chain_method):
+    def mcmc(prior_of):
+        return MCMC(
+            EllipticalSlice(lambda: scanned(prior_of)),
+            num_warmup=300,
+            num_samples=2000,
+            num_chains=2,
+            chain_method=chain_method,
+            progress_bar=False,
+        )
+
+    with pytest.raises(
+        ValueError, match=r"independent a priori, got 'x', whose prior changes with the draw; in a scan"
+    ):
+        mcmc(lambda total: dist.Normal(total, 1.0)).run(jax.random.key(1))
+    steps = mcmc(lambda total: dist.Normal(0.0, 1.0))
+    steps.run(jax.random.key(1))
+    design = np.tril(np.ones((5, 5)))  # y = design @ x + noise
+    exact = np.linalg.solve(np.eye(5) + design.T @ design / 0.25, design.T @ np.arange(1.0, 6.0) / 0.25)
+    np.testing.assert_allclose(np.asarray(steps.get_samples()["x"]).mean(axis=0), exact, atol=0.08)

@@ -399,3 +399,21 @@ def test_in_many_dimensions_the_settings_of_the_prior_are_as_many_and_let_one_ma
     assert np.sum(mattering == 1) == alone
     if dimensions <= 24:  # each dimension in some setting
         assert np.all(np.any(multiples[mattering == 1] < 9.0, axis=0))
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (lambda s: np.ma.masked_array(s, s > 0.5), "features <lambda>: expected numbers, got masked entries"),
+        (lambda s: [[1.0]] + [[1.0, 2.0]] * 4, "features <lambda>: expected rows of numbers, all equally long, got"),
+    ],
+)
+def test_masked_entries_and_rows_of_different_lengths_are_named(features, message):
+    with pytest.raises(ValueError, match=message):
+        checked_features(features, np.ones((5, 2)))
+
+
+@pytest.mark.parametrize("actions", [[1], [0, 1, 2], np.zeros(2), [0, 3]])
+def test_each_state_has_an_action_of_those_there_are(actions):
+    with pytest.raises(ValueError, match=r"^actions: expected"):
+        StateActionProduct(OneHot(2), 3)(np.array([0, 1]), actions)

@@ -141,6 +141,13 @@ def test_differences_that_do_not_fit_are_refused(bad):
         answer_probabilities(tree, bad)
 
 
+@pytest.mark.parametrize("sides", [[0.5, np.nan], [5, -7], [1], [1, -1, 1]])
+def test_sides_that_are_none_are_refused(sides):
+    tree = sample_posterior(np.eye(3)[:2], shown_first=[1, -1], num_warmup=25, num_samples=25, max_samples=25)
+    with pytest.raises(ValueError, match="shown_first: expected"):
+        answer_probabilities(tree, np.ones((2, 3)), Answers(shown_first=sides))
+
+
 def test_who_is_asked_and_which_side_is_shown_count_by_hand():
     rows = np.array([[1.0], [0.6], [-0.5], [0.8], [-0.9], [0.3]])
     sides, who = np.array([1, -1, 1, 1, 1, -1]), ["Ada", "Bob", "Bob", "Ada", "Bob", "Ada"]

@@ -60,6 +60,8 @@ def test_gains_are_counted_by_what_the_schedule_said():
     np.testing.assert_allclose(result["updates"], [2, 2])
     np.testing.assert_allclose(result["gained"], [1.0, 0.5])
     np.testing.assert_allclose(result["stated"], [0.3, 0.96])
+    part = gain_calibration(runs, edges=(0.5, 0.96))  # 0.3 and 0.97 are in no bin
+    np.testing.assert_allclose([part["updates"], part["stated"], part["gained"]], [[1], [0.95], [1.0]])
     back = run((3, 0.3), (-1, 0.3), (2, 0.3))
     back[2]["check"] = {"stepped_back": True, "best": 1}  # from 3 to 2
     np.testing.assert_allclose(gain_calibration([back], edges=(0, 0.5, 1))["gained"][0], 0.0)

@@ -144,7 +144,15 @@ def test_a_schedule_that_decides_nonsense_is_named(value):
 
 
 @pytest.mark.parametrize(
-    "statistics", [{"gain": np.ones(2)}, {"gain": {"mean": 1.0}}, {"reason": 1.0}, {"signal": 1.0}, {1: 1.0}]
+    "statistics",
+    [
+        {"gain": np.ones(2)},
+        {"gain": {"mean": 1.0}},
+        {"reason": 1.0},
+        {"signal": 1.0},
+        {1: 1.0},
+        {"gain": np.complex128(1j)},
+    ],
 )
 def test_statistics_that_could_not_be_kept_are_named(statistics):
     with pytest.raises(ValueError, match=r"schedule .*: expected named numbers as statistics, got"):

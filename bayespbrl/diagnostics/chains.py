@@ -86,7 +86,8 @@ def plot_ranks(tree: xr.DataTree, axes: Axes, *, preference: int | None = None, 
         preference = int(np.argmax(chain_convergence(margins).rhat))
     preference = checks.index("preference", preference, margins.shape[2])
     draws = margins[:, :, preference]
-    ranks = np.argsort(np.argsort(draws, axis=None)).reshape(draws.shape)
+    equal = np.random.default_rng(0).random(draws.size)  # decides among equal draws, which no chain has first
+    ranks = np.argsort(np.lexsort((equal, draws.ravel()))).reshape(draws.shape)
     for chain, row in enumerate(ranks):
         counts, edges = np.histogram(row, bins=bins, range=(0, draws.size))
         axes.stairs(counts * bins / row.size, edges, baseline=None, label=f"chain {chain}")

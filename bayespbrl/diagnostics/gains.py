@@ -24,7 +24,7 @@ def gain_calibration(
       runs: the iterations' summaries of each run.
       statistic: `agreement`, the share of the posterior draws that call the update a gain; `signal`; or any other
         statistic of the schedule in [0, 1].
-      edges: of the bins, increasing; the last is closed.
+      edges: of the bins, increasing; the last is closed. What is in none of them is left out.
 
     Returns:
       along `bin`: `lower` and `upper` edge, `updates` (their number), `stated` (mean statistic), `gained` (the share
@@ -41,7 +41,9 @@ def gain_calibration(
         raise ValueError("runs: expected the iterations of several runs, a list for each, got something else")
     pairs = [pair for summaries in of_each for pair in _stated_and_gained(summaries, statistic)]
     stated, gained = np.reshape(np.array(pairs, dtype=float), (-1, 2)).T
-    place = np.clip(np.searchsorted(bounds, stated, side="right") - 1, 0, len(bounds) - 2)
+    inside = (stated >= bounds[0]) & (stated <= bounds[-1])
+    stated, gained = stated[inside], gained[inside]
+    place = np.minimum(np.searchsorted(bounds, stated, side="right") - 1, len(bounds) - 2)
     counts = np.bincount(place, minlength=len(bounds) - 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = np.bincount(place, stated, len(bounds) - 1) / counts

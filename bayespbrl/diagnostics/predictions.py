@@ -37,13 +37,14 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: An
       shape (n, 3): the one is preferred, the other is preferred, no difference (0 where nothing was tied).
 
     Raises:
-      ValueError: differences of another shape or not finite.
+      ValueError: differences of another shape or not finite; sides or answerers that are none.
     """
     fitted = settings_of(np.asarray(tree["constant_data"]["differences"]))
     asked = settings_of(differences)
     if asked.shape[0] != fitted.shape[0] or asked.shape[2] != fitted.shape[2]:
         expected = ("C", "n", fitted.shape[2]) if len(fitted) > 1 else ("n", fitted.shape[2])
         raise ValueError(f"differences: expected shape {expected}, got {np.shape(differences)}")
+    _ = Answers(shown_first=answers.shown_first).checked(asked.shape[1])
     draws, model, who = _every(tree), fitted_model(tree), None
     fitted_to = answers_of(tree)
     if answers.answerers is not None and fitted_to.names is not None:

@@ -1,7 +1,8 @@
 """The KL bound of each update: constant, or by the posterior's confidence in the update (paper, conclusion).
 
 A schedule decides once per iteration, after the utility and Q are estimated and before the policy moves. It is called
-with the `Situation` and returns the bound in nats, or a `Bound` with its reason. Three lines make one of your own:
+with the `Situation` and returns the bound in nats, or a `Bound` with its reason. Two lines make one of your own, for a
+utility with a posterior (else `situation.update.q_draws` is None):
 
     def cautious(situation):
         return 0.5 if situation.update.agreement(0.5) > 0.9 else 0.1
@@ -153,4 +154,4 @@ def _can_be_kept(figure: object) -> bool:
     """Whether JSON can store it: a number, a text, None, or a list of them."""
     if isinstance(figure, list | tuple):
         return all(map(_can_be_kept, figure))
-    return figure is None or isinstance(figure, int | float | str | np.number | np.bool_)
+    return figure is None or isinstance(figure, int | float | str | np.integer | np.floating | np.bool_)

@@ -91,7 +91,7 @@ class ProposedUpdate:
         of the mean Q. That takes no solution of REPS.
         """
         if self.q_draws is None:
-            raise ValueError(f"gains: expected Q under posterior draws, got q_draws={self.q_draws}")
+            raise ValueError("gains: expected Q under posterior draws, got none: this utility has no posterior")
         if kl_bound is None:
             promised = advantages(self.q_values, self.constraint, self.base_weights)  # eq. 12 at small bounds
             return np.asarray((self.base_weights * promised) @ self.q_draws)

@@ -266,6 +266,18 @@ class EllipticalSlice(MCMCKernel):  # type: ignore[misc]  # NumPyro is untyped
                     f"model: expected latent sites independent a priori, got {name!r} depending on {others}; "
                     "reparametrise, or sample them with different blocks of numpyro.infer.Gibbs"
                 )
+        self._check_steps(latent, model_args, model_kwargs)
+
+    def _check_steps(self, latent: Sequence[str], model_args: Args, model_kwargs: Keywords) -> None:
+        """Check that no latent site of a `scan` depends on its own earlier steps: the dependencies see one site."""
+        first, second = (self._trace(random.key(number), {}, model_args, model_kwargs) for number in (0, 1))
+        for name in latent:
+            parameters = zip(jax.tree.leaves(first[name]["fn"]), jax.tree.leaves(second[name]["fn"]), strict=True)
+            if not all(isinstance(one, jax.core.Tracer) or np.array_equal(one, other) for one, other in parameters):
+                raise ValueError(
+                    f"model: expected latent sites independent a priori, got {name!r}, whose prior changes with "
+                    "the draw; in a scan, sample the increments and add them up"
+                )
 
     def postprocess_fn(self, model_args: Args, model_kwargs: Keywords | None) -> Callable[[SiteValues], SiteValues]:
         """From the latent sites to these and the model's deterministic ones."""
