@@ -9,18 +9,18 @@ import numpy as np
 MOST_SEED = 2**63 - 1
 
 
-def whole(name: str, value: Any, least: int = 1) -> int:
-    """`value` as an int, where it is a whole number >= `least`."""
+def whole(name: str, value: Any, least: int = 1, *, most: int | None = None) -> int:
+    """`value` as an int, where it is a whole number >= `least`, and <= `most` unless that is None."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}: expected a whole number >= {least}, got {value!r}")
+    if most is not None and value > most:
+        raise ValueError(f"{name}: expected at most {most}, got {value}")
     return int(value)
 
 
 def seed(value: Any) -> int:
     """A seed as an int, where it is a whole number that a run can keep."""
-    if whole("seed", value, 0) > MOST_SEED:
-        raise ValueError(f"seed: expected at most {MOST_SEED}, got {value}")
-    return int(value)
+    return whole("seed", value, 0, most=MOST_SEED)
 
 
 def boolean(name: str, value: Any) -> bool:

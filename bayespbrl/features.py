@@ -163,7 +163,7 @@ class StateActionProduct:
         states, actions = self.state_features(observations), indices("actions", actions, self.number_of_actions)
         if len(states) != len(actions):
             raise ValueError(f"actions: expected {len(states)}, one for each state, got {len(actions)}")
-        return (states[:, :, None] * OneHot(self.number_of_actions)(actions)[:, None, :]).reshape(len(states), -1)
+        return (states[:, :, None] * np.eye(self.number_of_actions)[actions][:, None, :]).reshape(len(states), -1)
 
 
 @dataclass(frozen=True, eq=False)

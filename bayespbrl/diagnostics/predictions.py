@@ -44,14 +44,14 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: An
     if asked.shape[0] != fitted.shape[0] or asked.shape[2] != fitted.shape[2]:
         expected = ("C", "n", fitted.shape[2]) if len(fitted) > 1 else ("n", fitted.shape[2])
         raise ValueError(f"differences: expected shape {expected}, got {np.shape(differences)}")
-    _ = Answers(shown_first=answers.shown_first).checked(asked.shape[1])
+    shown = Answers(shown_first=answers.shown_first).checked(asked.shape[1]).shown_first
     draws, model, who = _every(tree), fitted_model(tree), None
     fitted_to = answers_of(tree)
     if answers.answerers is not None and fitted_to.names is not None:
         who = np.asarray(replace(answers, names=fitted_to.names).checked(asked.shape[1]).answerers)
         draws["lapse_rate"] = draws["lapse_rates"][:, who]
     if fitted_to.shown_first is not None:  # features more: the sides
-        sides = np.zeros(asked.shape[1], int) if answers.shown_first is None else answers.shown_first
+        sides = np.zeros(asked.shape[1], int) if shown is None else shown
         asked = replace(fitted_to, shown_first=sides, answerers=who).with_sides(asked, model.prior_scale)
     probabilities = np.zeros((asked.shape[1], 3))
     for number, (basis, rows) in enumerate(zip(bases_of(tree), asked, strict=True)):

@@ -105,7 +105,7 @@ def made_again(name: str) -> gymnasium.Env:
 
 def given_by_name(environment: object) -> bool:
     """Whether an environment or spec is what gymnasium makes of its name, as far as its arguments tell."""
-    spec = environment if isinstance(environment, EnvSpec) else getattr(environment, "spec", None)
+    spec = _spec_of(environment)
     if spec is None or (registered := gymnasium.registry.get(spec.id)) is None:
         return False
     named = [
@@ -121,7 +121,13 @@ def identity(environment: object) -> str | None:
     if isinstance(environment, str):
         return SHORT_NAMES.get(environment, environment).rpartition(":")[2]
     given = as_given(environment) if isinstance(environment, gymnasium.Env) else environment
-    return (given if isinstance(given, EnvSpec) else given.spec).id if given_by_name(given) else None  # type: ignore[attr-defined]
+    spec = _spec_of(given)
+    return spec.id if spec is not None and given_by_name(given) else None
+
+
+def _spec_of(environment: object) -> EnvSpec | None:
+    """The spec of an environment, or the spec that it is; None without one."""
+    return environment if isinstance(environment, EnvSpec) else getattr(environment, "spec", None)
 
 
 def _same(first: Any, second: Any) -> bool:
@@ -301,7 +307,7 @@ def given_to_plain(space: gymnasium.Space[Any], value: Any, actions: gymnasium.S
 def _check_number(space: Discrete, value: Any, *, within: bool = True) -> None:
     """Check that `value` is a whole number, and one of `space` unless that is looked at elsewhere."""
     number = np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"
-    outside = number and within and not space.start <= value < space.start + space.n
+    outside = number and within and not _parts_within(space, value)
     if not number or outside or not np.isfinite(value) or value != int(value):
         raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
 

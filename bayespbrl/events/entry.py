@@ -72,9 +72,7 @@ def checked_about(event: Mapping[str, Any]) -> dict[str, Any]:
     if event.get("seconds") is not None:
         known["seconds"] = checks.non_negative("seconds", event["seconds"])
     if event.get("replays") is not None:
-        known["replays"] = checks.whole("replays", event["replays"], 0)
-        if known["replays"] > MOST_REPLAYS:
-            raise ValueError(f"replays: expected at most {MOST_REPLAYS}, got {known['replays']}")
+        known["replays"] = checks.whole("replays", event["replays"], 0, most=MOST_REPLAYS)
     return known
 
 

@@ -107,12 +107,8 @@ class Rollouts:
     initial_action_scale: float = 0.75
 
     def __post_init__(self) -> None:
-        number = checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2)
-        if number > MOST_TRAJECTORIES:
-            raise ValueError(f"trajectories_per_iteration: expected at most {MOST_TRAJECTORIES}, got {number}")
-        checks.optional(checks.whole, "max_steps", self.max_steps)
-        if self.max_steps is not None and self.max_steps > MOST_STEPS:
-            raise ValueError(f"max_steps: expected at most {MOST_STEPS}, got {self.max_steps}")
+        checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2, most=MOST_TRAJECTORIES)
+        checks.optional(checks.whole, "max_steps", self.max_steps, most=MOST_STEPS)
         checks.optional(checks.whole, "exploration_hold", self.exploration_hold)
         checks.whole("evaluation_episodes", self.evaluation_episodes)
         checks.one_of("policy", self.policy, ("auto", *POLICIES, "other"))

@@ -118,8 +118,9 @@ def prequential_table(contents: RunContents) -> xr.Dataset:
     As of `score_predictions`, without ties, skips, answers that could not be predicted, and those of the first
     iteration, which has no posterior.
     """
-    predicted = np.array([answer.predicted for answer in contents.scored])
-    observed = np.array([answer.answer is Answer.FIRST for answer in contents.scored], dtype=bool)
+    scored = contents.scored
+    predicted = np.array([answer.predicted for answer in scored])
+    observed = np.array([answer.answer is Answer.FIRST for answer in scored], dtype=bool)
     return score_predictions(np.clip(predicted, 0, 1), observed)
 
 
