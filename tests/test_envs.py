@@ -18,8 +18,9 @@ from toys import Odd, Push
 import bayespbrl
 from bayespbrl import envs
 from bayespbrl.envs import functional
-from bayespbrl.envs.opening import open_environment, to_plain
+from bayespbrl.envs.opening import open_environment
 from bayespbrl.envs.pictures import draw_trajectory, film, frames
+from bayespbrl.envs.spaces import to_plain
 from bayespbrl.policies import LinearGaussianPolicy, SoftmaxPolicy
 from bayespbrl.rollouts import rollout
 

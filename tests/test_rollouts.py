@@ -16,7 +16,7 @@ from toys import Push
 
 import bayespbrl
 from bayespbrl import rollouts
-from bayespbrl.envs import functional, opening
+from bayespbrl.envs import functional, opening, spaces
 from bayespbrl.envs.gridworld import Gridworld
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.envs.stepping import of_whole_episodes, random_episodes, step_limit
@@ -266,9 +266,9 @@ def test_an_optimum_is_of_the_tasks_own_episodes(steps, optimum):
 
 @pytest.mark.parametrize("value", [1.5, np.nan])
 def test_no_fraction_passes_for_a_number_of_a_discrete_space(value):
-    assert opening.to_plain(Discrete(5, start=1), 2.0) == 1
+    assert spaces.to_plain(Discrete(5, start=1), 2.0) == 1
     with pytest.raises(ValueError, match=r"observation: expected one of Discrete\(5, start=1\), got"):
-        opening.to_plain(Discrete(5, start=1), value)
+        spaces.to_plain(Discrete(5, start=1), value)
 
 
 def test_users_wrappers_are_not_bypassed():

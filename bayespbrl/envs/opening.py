@@ -10,18 +10,17 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.experimental.functional import FuncEnv
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple, flatten, flatten_space
+from gymnasium.spaces import Box, Discrete, Space
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformAction, TransformObservation
 
 from bayespbrl import checks
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.envs.functional import FunctionalEnv
+from bayespbrl.envs.spaces import bounded, from_plain, plain_space, to_plain
 
 # Attributes of dynamics that are about their own observations.
 OF_OBSERVATIONS = ("observation_period", "observation_names", "draw", "draw_trajectory", "pose", "grid_shape")
 AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
-
-NO_BOUND = 1e30  # an action's bound beyond it stands for none
 
 # Environments that we made from an id, and that can therefore be made again, N at a time.
 _MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
@@ -208,9 +207,9 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
         raise ValueError(
             f"environment {environment_name(env)}: expected a Discrete or real Box action space, got {actions}"
         )
-    if (plain := _plain_space(observations, actions)) is not observations:
+    if (plain := plain_space(observations, actions)) is not observations:
         env = TransformObservation(env, lambda value: to_plain(observations, value, actions), plain)
-    if (plain := _bounded(_plain_space(actions))) is not actions:
+    if (plain := bounded(plain_space(actions))) is not actions:
         env = TransformAction(env, lambda value: from_plain(actions, value), plain)
     if env is not given:
         _GIVEN[env] = given
@@ -220,98 +219,3 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
 def as_given(env: gymnasium.Env) -> gymnasium.Env:
     """The user's environment that `flattened` wrapped, with its own spaces; `env` itself where it wrapped nothing."""
     return _GIVEN.get(env, env)
-
-
-def _plain_space(space: Space[Any], actions: Space[Any] | None = None) -> Box | Discrete:
-    if isinstance(space, Discrete) and isinstance(actions, Box):  # no policy is a table of continuous actions
-        return Box(0.0, 1.0, (int(space.n),), np.float64)
-    if isinstance(space, Discrete):
-        return space if space.start == 0 else Discrete(int(space.n))
-    if isinstance(space, Box):
-        if len(space.shape) == 1:
-            return space
-        return Box(space.low.reshape(-1), space.high.reshape(-1), dtype=space.dtype.type)
-    parts: Any = flatten_space(space)
-    return Box(parts.low.astype(np.float64), parts.high.astype(np.float64), dtype=np.float64)
-
-
-def _bounded(space: Box | Discrete) -> Box | Discrete:
-    """The space without bounds that stand for none, such as the largest number: no exploration could reach them."""
-    if isinstance(space, Discrete):
-        return space
-    bounds = np.array([space.low, space.high])
-    none = np.isfinite(bounds) & (np.abs(bounds.astype(np.float64)) > NO_BOUND)
-    if not none.any():
-        return space
-    low, high = np.where(none, np.copysign(np.inf, bounds), bounds)
-    return Box(low, high, dtype=space.dtype.type)
-
-
-def check_of_space(name: str, values: np.ndarray, space: gymnasium.Space[Any]) -> None:
-    """Check that rows are of a flattened space: shape (N, n), or whole numbers below its size."""
-    if isinstance(space, Discrete):
-        fits = values.ndim == 1 and values.dtype.kind in "iu" and bool(np.all((values >= 0) & (values < space.n)))
-    else:
-        fits = values.ndim == 2 and values.dtype.kind == "f" and values.shape[1:] == space.shape
-    if not fits:
-        raise ValueError(f"{name}: expected entries of {space}, got {values.dtype} of shape {values.shape}")
-
-
-def to_plain(
-    space: gymnasium.Space[Any], value: Any, actions: gymnasium.Space[Any] | None = None
-) -> np.ndarray | np.int64:
-    """An observation of `space`, flattened, one-hot where it is discrete and `actions` are not.
-
-    Raises:
-      ValueError: one that cannot be one-hot, or whose parts are not those of the space.
-    """
-    if isinstance(space, Discrete) and isinstance(actions, Box):
-        _check_number(space, value)
-        return np.eye(int(space.n))[int(value - space.start)]
-    if isinstance(space, Discrete):
-        _check_number(space, value, within=False)
-        return np.int64(value - space.start)
-    if isinstance(space, Box):
-        return np.reshape(value, -1)
-    try:
-        if _parts_within(space, value):
-            return np.asarray(flatten(space, value), np.float64)
-        why = None
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        why = error
-    raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}") from why
-
-
-def _parts_within(space: Any, value: Any) -> bool:
-    """Whether the discrete parts of an observation are of their spaces: gymnasium takes others for some that are."""
-    if isinstance(space, Dict):
-        return all(_parts_within(part, value[name]) for name, part in space.spaces.items())
-    if isinstance(space, Tuple):
-        return all(map(_parts_within, space.spaces, value))
-    values = np.asarray(value)
-    if isinstance(space, MultiBinary):
-        return bool(np.all((values == 0) | (values == 1)))
-    if isinstance(space, Discrete | MultiDiscrete):
-        number = space.n if isinstance(space, Discrete) else space.nvec
-        return bool(np.all((values >= space.start) & (values < space.start + number)))
-    return True
-
-
-def given_to_plain(space: gymnasium.Space[Any], value: Any, actions: gymnasium.Space[Any]) -> np.ndarray | np.int64:
-    """`to_plain` of an observation that the user gives; `ValueError` also for one outside a discrete space."""
-    if isinstance(space, Discrete):
-        _check_number(space, value)
-    return to_plain(space, value, actions)
-
-
-def _check_number(space: Discrete, value: Any, *, within: bool = True) -> None:
-    """Check that `value` is a whole number, and one of `space` unless that is looked at elsewhere."""
-    number = np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"
-    outside = number and within and not _parts_within(space, value)
-    if not number or outside or not np.isfinite(value) or value != int(value):
-        raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}")
-
-
-def from_plain(space: Any, value: Any) -> np.ndarray | np.int64:
-    """An action of `space`, from a flattened one."""
-    return np.reshape(value, space.shape) if isinstance(space, Box) else np.int64(value + space.start)

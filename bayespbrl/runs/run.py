@@ -10,15 +10,8 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import checks, rollouts
-from bayespbrl.envs.opening import (
-    AnyEnvironment,
-    check_of_space,
-    from_plain,
-    given_to_plain,
-    identity,
-    imported_by_name,
-    made_again,
-)
+from bayespbrl.envs.opening import AnyEnvironment, identity, imported_by_name, made_again
+from bayespbrl.envs.spaces import check_of_space, from_plain, given_to_plain
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner

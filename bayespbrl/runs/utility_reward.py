@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 
 from bayespbrl import checks
-from bayespbrl.envs.opening import to_plain
+from bayespbrl.envs.spaces import to_plain
 from bayespbrl.runs.run import Run
 
 DRAWS = 200  # for the standard deviation: known to a twentieth
