@@ -323,11 +323,16 @@ def test_predictions_are_those_that_the_report_shows_and_old_runs_are_read_anew(
     study = Study.prepare(parsed(RUN, "run"), tmp_path / "run")
     assert study.run() == []
     (tmp_path / "run" / "iterations.csv").unlink()  # as if it had been stopped
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    assert call(monkeypatch, "results", tmp_path / "run", "--out", tmp_path / "out") == 0
+    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
     assert call(monkeypatch, "results", tmp_path / "run") == 0
     kept = pd.read_csv(tmp_path / "run" / "answers.csv")
     shown = [a for a in read_contents(tmp_path / "run" / "gridworld" / "seed-2970").answers if a.iteration > 1]
     np.testing.assert_allclose(kept["predicted"], [a.predicted for a in shown if a.row is not None], rtol=1e-5)
-    assert "Calibration" in (tmp_path / "run" / "results.md").read_text()
+    page = (tmp_path / "run" / "results.md").read_text()
+    assert "Calibration" in page
+    assert (tmp_path / "out" / "results.md").read_text() == page
     data = shutil.copytree(tmp_path / "run", tmp_path / "data", ignore=shutil.ignore_patterns("gridworld", "results*"))
     assert call(monkeypatch, "results", data) == 0  # the four files are enough
     assert (data / "results.md").read_text() == (tmp_path / "run" / "results.md").read_text()

@@ -277,7 +277,9 @@ def study(
 def results(
     directories: Annotated[list[Path], typer.Argument(help="Directories of studies.", metavar="DIR...")],
     *,
-    out: Annotated[Path | None, typer.Option(help="Where to write; into each study's directory if omitted.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Where to write, the study staying as it is; into its directory if omitted.")
+    ] = None,
 ) -> None:
     """Write tables (Markdown, CSV) and figures of studies, with intervals and counted comparisons."""
     from bayespbrl.results import write_results

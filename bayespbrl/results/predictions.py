@@ -10,17 +10,21 @@ from bayespbrl.models.threads import cores
 from bayespbrl.preferences import Answer
 from bayespbrl.results.study_data import ANSWER_COLUMNS
 from bayespbrl.studies.processes import trial_processes
-from bayespbrl.studies.study import Study, write_lines
+from bayespbrl.studies.study import Study
 
 FEW = 8  # runs that are not worth a process
 
 
-def write_predictions(study: Study) -> list[str]:
+def write_predictions(study: Study, out: Path) -> list[str]:
     """Write `answers.csv` of the finished trials: predictions by the posterior at the time of the question.
 
     The first iteration, which has no posterior, and answers that state no preference are left out. What the file has of
     trials whose run directories are gone or damaged stays. To read a run takes seconds, so where there are many, each
     core has a process.
+
+    Args:
+      study: the study.
+      out: the directory to write to.
 
     Returns:
       what could not be read, a line each.
@@ -54,7 +58,7 @@ def write_predictions(study: Study) -> list[str]:
     lines = [[*levels, seed, *answer] for levels, seed, answers in whole for answer in answers]
     read = study.trials_with(False) | {(levels, seed) for levels, seed, _ in whole}
     table = pd.DataFrame(lines, columns=ANSWER_COLUMNS)
-    write_lines(study.directory / "answers.csv", table, study.declaration, read)
+    study.write_lines("answers.csv", table, read, out)
     return [f"{path}: {damage}" for path, (_, damage) in zip(paths, predicted, strict=True) if damage]
 
 

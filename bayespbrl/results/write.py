@@ -1,9 +1,11 @@
 """`bayespbrl results`: the tables of a study in Markdown and CSV, and its figures, beside its data."""
 
+import shutil
 import warnings
 from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pandas as pd
 
@@ -58,8 +60,13 @@ def columns_of(names: Iterable[str]) -> str:
     return "\n".join(f"- **{TITLES[name]}**: {NOTES[name]}" for name in names)
 
 
-def refreshed(directory: Path) -> tuple[StudyData, list[str]]:
-    """The data of a study, first rewritten from its run directories where this version made them.
+def refreshed(directory: Path, out: Path) -> tuple[StudyData, list[str]]:
+    """The data of a study, from its run directories where this version made them.
+
+    Args:
+      directory: of the study.
+      out: where its tables are written anew, if they are: `directory`, or a folder of their own, which leaves it as it
+        is.
 
     Returns:
       the data, and what could not be read, a line each: what the tables had of it stands.
@@ -71,10 +78,14 @@ def refreshed(directory: Path) -> tuple[StudyData, list[str]]:
     if ours and any((directory / row.name).is_dir() for row in declaration.rows):
         trials = description.get("trials")
         study = Study.prepare(declaration, directory, trials=trials if isinstance(trials, int) else None)
-        study.write_table()
+        study.write_table(out)
         unread = [f"{seeds.row.path(seed)}: {why}" for seeds in study.rows for seed, why in seeds.damaged.items()]
-        unread += write_predictions(study)
-    return read_study(directory), unread
+        unread += write_predictions(study, out)
+    if out == directory or not (out / "iterations.csv").exists():
+        return read_study(directory), unread
+    for name in ("study.json", "study.toml"):
+        shutil.copy(directory / name, out / name)
+    return read_study(out), unread
 
 
 def tables_of(data: StudyData) -> dict[str, pd.DataFrame]:
@@ -102,7 +113,7 @@ def write_results(directory: Path | str, out: Path | str | None = None) -> list[
 
     Args:
       directory: of the study, or of its four data files.
-      out: where to write; None: into `directory`.
+      out: where to write; None: into `directory`. Otherwise `directory` stays as it is.
 
     Returns:
       the files, `results.md` first.
@@ -110,7 +121,9 @@ def write_results(directory: Path | str, out: Path | str | None = None) -> list[
     Raises:
       ValueError: no study, none of its trials finished, or damaged data.
     """
-    data, unread = refreshed(Path(directory))
+    directory = Path(directory)
+    with TemporaryDirectory() as aside:
+        data, unread = refreshed(directory, directory if out is None else Path(aside))
     if unread:
         warnings.warn(f"not read: {'; '.join(unread)}", stacklevel=2)
     out = Path(directory if out is None else out)

@@ -172,31 +172,44 @@ class Study:
         write_file(self.directory / "study.toml", self.declaration.text)
         write_file(self.directory / "study.json", json.dumps(content, indent=1) + "\n")
 
-    def write_table(self) -> None:
-        """Write `iterations.csv` of the finished trials; lines of those whose run directories are gone stay."""
+    def write_table(self, out: Path | None = None) -> None:
+        """Write `iterations.csv` of the finished trials; lines of those whose run directories are gone stay.
+
+        Args:
+          out: the directory to write to; None: the study's.
+        """
         finished = [row for row in zip(self.declaration.rows, self.rows, strict=True) if row[1].with_outcome(True)]
         if finished:
             lines = pd.concat([_table_of(declared.levels, seeds) for declared, seeds in finished])
-            write_lines(self.directory / "iterations.csv", lines, self.declaration, self.trials_with(True))
+            self.write_lines("iterations.csv", lines, self.trials_with(True), out)
+
+    def write_lines(self, name: str, lines: pd.DataFrame, read: Set[Trial], out: Path | None = None) -> None:
+        """Write a table of trials. What the study's table of that name has of trials not read stays.
+
+        Args:
+          name: of the file.
+          lines: columns `AXES`, `seed` and others.
+          read: the trials whose lines these are.
+          out: the directory to write to; None: the study's.
+        """
+        file = self.directory / name
+        text = lines.to_csv(index=False, lineterminator="\n", float_format="%.6g")
+        if file.exists():
+            new, kept = (pd.read_csv(source, dtype=str, keep_default_na=False) for source in (StringIO(text), file))
+            if list(kept.columns) == list(new.columns):
+                kept = kept[[trial not in read for trial in _trials(kept)]]
+                whole = pd.concat([new, kept])
+                places = {row.levels: place for place, row in enumerate(self.declaration.rows)}
+                order = [(places.get(levels, len(places)), seed) for levels, seed in _trials(whole)]
+                text = whole.iloc[sorted(range(len(order)), key=order.__getitem__)].to_csv(
+                    index=False, lineterminator="\n"
+                )
+        write_file((out or self.directory) / name, text)
 
     def trials_with(self, outcome: bool) -> set[Trial]:
         """The trials on disk that count (True) or were redrawn (False)."""
         rows = zip(self.declaration.rows, self.rows, strict=True)
         return {(declared.levels, seed) for declared, seeds in rows for seed in seeds.with_outcome(outcome)}
-
-
-def write_lines(file: Path, lines: pd.DataFrame, declaration: Declaration, read: Set[Trial]) -> None:
-    """Write a table of trials, columns `AXES`, `seed` and others. Lines that it has of trials not in `read` stay."""
-    text = lines.to_csv(index=False, lineterminator="\n", float_format="%.6g")
-    if file.exists():
-        new, kept = (pd.read_csv(source, dtype=str, keep_default_na=False) for source in (StringIO(text), file))
-        if list(kept.columns) == list(new.columns):
-            kept = kept[[trial not in read for trial in _trials(kept)]]
-            whole = pd.concat([new, kept])
-            places = {row.levels: place for place, row in enumerate(declaration.rows)}
-            order = [(places.get(levels, len(places)), seed) for levels, seed in _trials(whole)]
-            text = whole.iloc[sorted(range(len(order)), key=order.__getitem__)].to_csv(index=False, lineterminator="\n")
-    write_file(file, text)
 
 
 def _trials(lines: pd.DataFrame) -> list[Trial]:
