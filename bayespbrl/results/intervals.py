@@ -13,6 +13,7 @@ from scipy import stats
 LEVEL = 0.95
 RESAMPLES = 10_000
 PROFILE_RESAMPLES = 2_000
+PARTS = 50  # in which resamples are evaluated: those of many trials at once need a gigabyte
 
 
 class Interval(NamedTuple):
@@ -97,7 +98,8 @@ def answers_for_good(answers: np.ndarray, values: np.ndarray, level: float) -> I
     if len(values) < 2:
         return Interval(float(needed(values)), np.nan, np.nan)
     tail = (1 - LEVEL) / 2
-    low, high = np.quantile(needed(values[resamples(len(values))]), [tail, 1 - tail], method="inverted_cdf")
+    drawn = np.concatenate([needed(values[rows]) for rows in np.array_split(resamples(len(values)), PARTS)])
+    low, high = np.quantile(drawn, [tail, 1 - tail], method="inverted_cdf")
     return Interval(float(needed(values)), float(low), float(high))
 
 
