@@ -75,19 +75,17 @@ class Cycle:
             the budget has left, and in the last iteration no more than it wants, which ends when they have answered.
             Then the result is None too.
         """
-        if state.finished(self.settings) or (others is None and state.open):
+        left = self.settings.questions.left(state.preferences.answers)
+        if state.finished(self.settings) or (others is None and state.open and left > 0):
             return None
         if not state.collected:
             return self.collect(state)
         newcomers = self._newcomers(state)
         last = state.iteration + 1 >= self.settings.last_iteration(state.started)
-        if not state.wanted or not (newcomers or others):
+        if not state.wanted or left <= 0 or not (newcomers or others):
             return None if last and others else self.improve(state)
-        if others:
-            room = self.settings.questions.left(state.preferences.answers)
-            room = min(room, state.wanted) if last else room
-            if room <= others or not newcomers:
-                return None
+        if others and (not newcomers or others >= (min(left, state.wanted) if last else left)):
+            return None
         return self.show(state, answerer)
 
     def _newcomers(self, state: LearnerState) -> list[int]:

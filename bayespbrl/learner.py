@@ -188,7 +188,7 @@ class Learner:
         """The question that waits for an answer, after doing whatever comes before it; empty when finished.
 
         Each new trajectory is compared with the best of all before it, so there is one question at a time. Where
-        several people answered at once, all questions that they left wait.
+        several people answered at once, all questions that they left wait, as far as the budget goes.
         """
         self._advance()
         return self._waiting()
@@ -278,7 +278,7 @@ class Learner:
     def _question_for(self, answerer: str | None, progress: Callable[["Learner"], None] | None) -> Query | None:
         """The question for a person, asked if need be; None when finished."""
         while not self.finished:
-            for query in self.state.open:
+            for query in self.state.open if self._waiting() else ():
                 if self.state.may_answer(query, answerer, self.settings):
                     return query
             entry = self.cycle.next(self.state, answerer, others=0)  # past the questions of others
@@ -312,7 +312,9 @@ class Learner:
         return ComparisonWidget(self, most_answers=answers, answerer=answerer, practice=practice)
 
     def _waiting(self) -> list[Query]:
-        return [] if self.finished else list(self.state.open)
+        """The open questions, no more than the budget has answers left."""
+        left = self.settings.questions.left(self.preferences.answers)
+        return [] if self.finished else [query for place, query in enumerate(self.state.open) if place < left]
 
     def _advance(self, progress: Callable[["Learner"], None] | None = None) -> None:
         """Do what can be done without an answer; `progress` is called after each iteration."""

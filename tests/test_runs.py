@@ -818,6 +818,42 @@ def test_a_log_that_leads_elsewhere_is_refused_and_left_alone(tmp_path):
     assert (tmp_path / "secret").read_text() == "no line"
 
 
+def test_iterations_that_lead_elsewhere_are_refused_and_left_alone(tmp_path):
+    """Those of another run would be overwritten."""
+    other = bayespbrl.start("gridworld", tmp_path / "other", **QUICK)
+    other.ask()
+    before = other.log.iteration_file(1).read_bytes()
+    bayespbrl.start("gridworld", tmp_path / "run", **QUICK | {"seed": 8})
+    (tmp_path / "run" / "iterations").rmdir()
+    (tmp_path / "run" / "iterations").symlink_to(tmp_path / "other" / "iterations")
+    with pytest.raises(ValueError, match="iterations: expected a folder of the run's own, got a link"):
+        runs.resume(tmp_path / "run")
+    assert other.log.iteration_file(1).read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["settings.json", "summary.json", "iterations/0001.nc"])
+def test_a_pipe_in_a_run_is_not_waited_for(name, tmp_path):
+    learner = bayespbrl.start("gridworld", tmp_path / "run", **QUICK)
+    while not learner.state.iteration:
+        learner.tell(["first"] * len(learner.ask()))
+    (tmp_path / "run" / name).unlink()
+    os.mkfifo(tmp_path / "run" / name)
+    if name == "summary.json":  # follows from the log
+        assert bayespbrl.load(tmp_path / "run").learner.state.iteration == 1
+        with pytest.raises(ValueError, match="got something that is no file"):
+            run_directory.read_summary(tmp_path / "run")
+    else:
+        with pytest.raises(ValueError, match="got something that is no file"):
+            bayespbrl.load(tmp_path / "run")
+
+
+def test_a_path_that_could_not_be_read_back_is_refused_before_anything_is_asked(tmp_path):
+    path = tmp_path / os.fsdecode(b"a\xff")
+    with pytest.raises(ValueError, match="expected a path in UTF-8"):
+        bayespbrl.start("gridworld", path, **QUICK)
+    assert not path.exists()
+
+
 def test_what_another_learner_writes_while_heavy_parts_are_written_is_noticed(tmp_path, monkeypatch):
     learner = bayespbrl.start("gridworld", tmp_path / "run", **QUICK)
     written = run_directory.write_iteration

@@ -10,13 +10,14 @@ from test_page import KEYS, answers_of, call, next_turn, served, tab, turn_of
 from toys import QUICK, fingerprint
 
 import bayespbrl
+from bayespbrl import events
 from bayespbrl.cli.commands import main
 from bayespbrl.diagnostics import people
 from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session
 from bayespbrl.people.views import FAILED, FINISHED, QUESTION, WAITING
-from bayespbrl.preferences import Preferences
+from bayespbrl.preferences import Answer, Preferences
 
 WAIT = 120  # seconds at most
 SEEN = (QUESTION, WAITING, FINISHED, FAILED)
@@ -98,6 +99,45 @@ def test_an_answer_follows_as_if_nobody_else_were_there(sitting):
     settled(session)
     assert session.learner.state.iteration == 2
     assert session.learner.preferences.answers == 3
+
+
+def by_two(budget, ends=lambda state, held: False):
+    """A run of two people of whom Ada leaves repeated questions for later, until `ends` of the state and who holds."""
+    options = {"expert": "other", "repeats": 0.3, "iterations": 25, "answers": budget, "utility": "linear-program"}
+    learner = bayespbrl.Learner("gridworld", **QUICK | options)
+    ahead = Foresight(learner.cycle, learner.state, lambda *_: (None, tuple(Answer)), NAMES, several=True)
+    while not learner.finished:
+        while not ahead.present.complete:
+            if (entry := ahead.compute(ahead.present)) is not None:
+                assert entry.event["event"] != "asked" or learner.preferences.answers < budget
+                learner.record(entry)
+                ahead.keep(ahead.present, entry)
+        held = dict(ahead.present.holders)
+        if learner.finished or ends(learner.state, held):
+            break
+        again = {query.number for query in learner.state.open if query.repeats is not None}
+        number = next((number for number in held if number not in again), next(iter(held)))
+        learner.record(events.answered(number, Answer.FIRST, answerer=held[number]))
+        ahead.move(number, Answer.FIRST, learner.state)
+    return learner
+
+
+@pytest.mark.parametrize("budget", [7, 10])
+def test_nobody_is_asked_beyond_the_budget_where_the_last_answer_is_to_a_repeated_question(budget):
+    learner = by_two(budget)
+    assert (learner.preferences.answers, learner.finished, learner.state.open) == (budget, True, ())
+
+
+def test_a_repeated_question_that_somebody_left_takes_no_answer_beyond_the_budget():
+    def one_left(state, held):
+        again = {query.number for query in state.open if query.repeats is not None}
+        return state.preferences.answers == 9 and held and set(held) <= again
+
+    learner = by_two(10, one_left)
+    (left,) = learner.state.open
+    assert left.answerer == "Ada"
+    learner.run(lambda first, second: "first", answerer="Ada")
+    assert (learner.preferences.answers, learner.finished) == (10, True)
 
 
 def test_the_other_ones_question_cannot_be_answered(sitting):

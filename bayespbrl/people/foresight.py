@@ -146,18 +146,19 @@ class Foresight:
     def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
         """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.
 
-        A repeated question is left to those who may answer it. Once the budget is spent nobody looks at any: one that
-        somebody has left open stays open.
+        A repeated question is left to those who may answer it. No more are looked at than the budget has answers left:
+        once it is spent nobody looks at any, and one that somebody has left open stays open.
         """
         settings = self.cycle.settings
-        if state.finished(settings) or settings.questions.left(state.preferences.answers) <= 0:
+        left = settings.questions.left(state.preferences.answers)
+        if state.finished(settings) or left <= 0:
             return {}
         waiting = {query.number: query for query in state.open}
         holders = {number: who for number, who in before.items() if number in waiting and who in self.people}
         for query in sorted(state.open, key=lambda query: query.answerer not in self.people):
             free = [who for who in self.people if who not in holders.values()]
             free = [who for who in free if state.may_answer(query, who, settings)]
-            if free and query.number not in holders:
+            if free and query.number not in holders and len(holders) < left:
                 holders[query.number] = query.answerer if query.answerer in free else free[0]
         return holders
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from bayespbrl.events import Entry, LearnerState, has_figures, surviving
 from bayespbrl.features import StateFeatures
-from bayespbrl.runs.files import write_file
+from bayespbrl.runs.files import check_file, synchronise, write_file
 from bayespbrl.runs.iteration_files import read_iteration, write_iteration
 from bayespbrl.settings import OPTIONS, Settings
 
@@ -41,9 +41,13 @@ class RunDirectory:
         """A new run directory. It appears together with its settings, or not at all.
 
         Raises:
-          ValueError: the path exists, or cannot be written.
+          ValueError: the path exists, or cannot be written, or is no UTF-8, which netCDF could not read.
         """
         path = Path(path)
+        try:
+            bytes(path.absolute()).decode()
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{str(path)!a}: expected a path in UTF-8, got another") from error
         content = {"format": FORMAT, "version": version("bayespbrl"), "env": settings.env, **settings.options()}
         try:
             if path.exists() or path.is_symlink():
@@ -55,6 +59,7 @@ class RunDirectory:
                 write_file(building / "settings.json", json.dumps(content, indent=2) + "\n")
                 (building / "iterations").mkdir()
                 building.rename(path)
+                synchronise(path.parent)
             except BaseException:
                 shutil.rmtree(building, ignore_errors=True)
                 raise
@@ -81,9 +86,7 @@ class RunDirectory:
             )
         if not isinstance(content.get("env"), str):
             raise ValueError(f"{file}: expected the environment's name as env, got {content.get('env')!r}")
-        log = path / "events.jsonl"  # of a stranger's run, it may lead to another file
-        if log.is_symlink() or (log.exists() and not log.is_file()):
-            raise ValueError(f"{log}: expected a file of the run's own, got a link or something that is no file")
+        _check_own(path)
         known = {name: value for name, value in content.items() if name in OPTIONS}
         try:
             return cls(path, Settings.from_options(content["env"], known))
@@ -120,6 +123,8 @@ class RunDirectory:
                 if file.write(line) != len(line):
                     raise OSError(f"{file.name}: the line was not written whole")
                 os.fsync(file.fileno())
+                if not before:
+                    synchronise(self.path)  # the log's name, too, outlasts a power failure
                 if entry.event["event"] in ("improved", "undone"):
                     self.write_summary(state)
                 self._end = file.tell()
@@ -266,8 +271,18 @@ def read_complete_summary(directory: Path | str) -> dict[str, Any]:
     return summary
 
 
+def _check_own(path: Path) -> None:
+    """`ValueError` where what is written to leads elsewhere, as it may in a stranger's run."""
+    log, folder = path / "events.jsonl", path / "iterations"
+    if log.is_symlink() or (log.exists() and not log.is_file()):
+        raise ValueError(f"{log}: expected a file of the run's own, got a link or something that is no file")
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise ValueError(f"{folder}: expected a folder of the run's own, got a link or something that is no folder")
+
+
 def _read_json(file: Path, expected: str) -> Any:
     try:
+        check_file(file)
         return json.loads(file.read_text())
     except RecursionError as error:
         raise ValueError(f"{expected}, got brackets nested too deeply") from error

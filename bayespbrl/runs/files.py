@@ -33,7 +33,7 @@ def written_aside(file: Path) -> Iterator[Path]:
         with aside.open("r+b") as written:
             os.fsync(written.fileno())
         aside.replace(file)
-        _synchronise(file.parent)
+        synchronise(file.parent)
     except BaseException as error:
         aside.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno is not None and error.filename is None:  # a full disk
@@ -41,7 +41,7 @@ def written_aside(file: Path) -> Iterator[Path]:
         raise
 
 
-def _synchronise(directory: Path) -> None:
+def synchronise(directory: Path) -> None:
     """Flush a directory, so that a file in it has its name after a power failure; not every system can."""
     with suppress(OSError):
         opened = os.open(directory, os.O_RDONLY)
@@ -49,6 +49,12 @@ def _synchronise(directory: Path) -> None:
             os.fsync(opened)
         finally:
             os.close(opened)
+
+
+def check_file(file: Path) -> None:
+    """`ValueError` for what is no file, as a pipe, which would be read for ever; a stranger's run may have one."""
+    if file.exists() and not file.is_file():
+        raise ValueError("something that is no file")
 
 
 def _drop_stale(directory: Path) -> None:

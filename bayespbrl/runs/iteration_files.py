@@ -13,7 +13,7 @@ from bayespbrl import checks
 from bayespbrl.events import Entry
 from bayespbrl.features import StateFeatures, checked_features
 from bayespbrl.models import restored, stored
-from bayespbrl.runs.files import NETCDF, write_netcdf
+from bayespbrl.runs.files import NETCDF, check_file, write_netcdf
 from bayespbrl.runs.stored_classes import from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import UtilityEstimate
@@ -67,6 +67,7 @@ def read_parts(
     # to look at the other groups takes ten times as long
     alone = "trajectories" if tuple(names) == ("trajectories",) else None
     try:
+        check_file(file)
         with NETCDF, xr.open_datatree(file, engine="netcdf4", decode_times=False, group=alone) as opened:
             _check_size(file, opened)
             tree = opened.load()
