@@ -83,7 +83,9 @@ class Teacher:
 
     Source: Lee, Smith, Dragan & Abbeel (2021), "B-Pref: Benchmarking preference-based reinforcement learning",
     section 3 and algorithm 1. Both thresholds are theirs as they are, without their multiple of the current policy's
-    return, on which an expert who sees two trajectories cannot depend.
+    return, on which an expert who sees two trajectories cannot depend. (By name, `skipping` skips what is below the
+    mean return of the first policy; their scripts take a tenth of the current policy's, which means little where
+    returns are negative.)
     """
 
     rationality: float = np.inf

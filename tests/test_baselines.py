@@ -175,6 +175,15 @@ def test_epmc_learns_which_action_is_the_best():
     assert next(every_visit_preferences(Push(4), lambda a, b: "tie", answers=1, seed=0, max_steps=4)).pairs == 0
 
 
+@pytest.mark.parametrize("ask", [every_visit_preferences, programming_by_feedback])
+def test_a_question_that_is_skipped_takes_no_answer_of_the_budget(ask):
+    task = {every_visit_preferences: Push(4), programming_by_feedback: "gridworld"}[ask]
+    said = iter(["skip", "first", "skip", "tie", "skip", "second"] + ["skip"] * 99)
+    steps = list(ask(task, lambda first, second: next(said), answers=3, seed=0, max_steps=4))
+    assert [(step.answers, step.pairs) for step in steps] == [(1, 1), (2, 1), (3, 2)]
+    assert not list(ask(task, lambda first, second: "skip", answers=2, seed=0, max_steps=4))
+
+
 DECLARATION = """
 seed = 2985
 trials = 1

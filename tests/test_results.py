@@ -2,8 +2,10 @@
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
@@ -32,6 +34,8 @@ title = "Hand-made"
 trials = 4
 seed = 1
 report_at = [3]
+[options]
+preset = "paper"
 [tasks.gridworld]
 [methods.first]
 [methods.second]
@@ -126,12 +130,24 @@ def test_a_value_after_more_answers_than_were_allowed_is_not_shown(made):
     assert first["after 6"] == first["after 5"]  # it might have asked once more
 
 
+def test_the_budget_of_the_default_counts_where_all_trials_of_a_row_ended_before_it(made):
+    without(made, lambda lines: (lines["methods"] == "first") & (lines["iteration"] > 1))
+    cut = values_table(read_study(made)).set_index("methods").loc["second"]
+    assert (cut["at answers"], cut["difference"][:3]) == ("2", "+0 ")  # under the paper's preset, which has none
+    (made / "study.toml").write_text(DECLARATION.replace("paper", "default"))
+    second = values_table(read_study(made)).set_index("methods").loc["second"]
+    assert second["at answers"] == "20"
+    assert second["difference"].startswith("+40 [")  # the last values: of +30, +40, +40, +40
+
+
 def test_trials_that_are_missing_are_counted_and_never_replaced_by_another_row(made):
     kept = json.loads((made / "study.json").read_text()) | {"trials": 4}
     (made / "study.json").write_text(json.dumps(kept))
     without(made, lambda lines: (lines["methods"] == "second") & (lines["seed"] == 2))
     second = values_table(read_study(made)).set_index("methods").loc["second"]
     assert (second["trials"], second["pairs"], second["seeds left out"]) == ("3 of 4", "3", "2")
+    without(made, lambda lines: (lines["methods"] == "second") & (lines["seed"] == 4))
+    assert values_table(read_study(made)).set_index("methods").loc["second", "seeds left out"] == "2, 4"
     without(made, lambda lines: lines["methods"] == "first")
     data = read_study(made)
     table = values_table(data)
@@ -168,7 +184,8 @@ def test_the_page_names_study_command_version_date_and_machine_and_counts_compar
     text = page.read_text()
     for part in ("Study `made`", "bayespbrl study made", "version 0.0", "2026-01-01", "a machine", "one comparison"):
         assert part in text
-    assert "| gridworld | first | the default | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
+    assert "| gridworld | first | preset=paper | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
+    assert "| gridworld | second | preset=paper utility=linear-program | – | – |" in text  # it has no posteriors
     assert {file.name for file in files} == {"values.csv", "runs.csv", "curves.png", "profiles.png"}
     assert sorted(path.name for path in made.iterdir()) == ["iterations.csv", "study.json", "study.toml"]
 
@@ -336,6 +353,42 @@ def test_predictions_are_those_that_the_report_shows_and_old_runs_are_read_anew(
     data = shutil.copytree(tmp_path / "run", tmp_path / "data", ignore=shutil.ignore_patterns("gridworld", "results*"))
     assert call(monkeypatch, "results", data) == 0  # the four files are enough
     assert (data / "results.md").read_text() == (tmp_path / "run" / "results.md").read_text()
+
+
+@pytest.mark.slow
+def test_the_package_of_an_environment_is_imported_with_permission_alone(monkeypatch, tmp_path, capsys):
+    """In the processes that read many runs, too."""
+    (tmp_path / "grid_of_mine.py").write_text(
+        "import gymnasium\n"
+        "gymnasium.register('GridOfMine-v0', entry_point='bayespbrl.envs.gridworld:Gridworld', max_episode_steps=20)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    text = RUN.replace("[tasks.gridworld]", "[tasks.mine]\nenv = 'grid_of_mine:GridOfMine-v0'")
+    assert Study.prepare(parsed(text, "run"), tmp_path / "run").run() == []
+    monkeypatch.delitem(sys.modules, "grid_of_mine")
+    monkeypatch.delitem(gymnasium.registry, "GridOfMine-v0")
+    line = refused(monkeypatch, capsys, "results", tmp_path / "run")
+    assert "expected permission to import 'grid_of_mine', which grid_of_mine:GridOfMine-v0 needs" in line
+    assert "grid_of_mine" not in sys.modules
+    monkeypatch.setattr("bayespbrl.results.predictions.FEW", 0)
+    assert call(monkeypatch, "results", tmp_path / "run", "--import-package") == 0
+    page = (tmp_path / "run" / "results.md").read_text()
+    assert "Calibration" in page
+    assert "Not read" not in page
+
+
+@pytest.mark.slow
+def test_runs_of_other_settings_leave_the_tables_as_they_are(monkeypatch, tmp_path):
+    """As where a preset has changed since."""
+    without_processes(monkeypatch)
+    study = Study.prepare(parsed(RUN, "run"), tmp_path / "run")
+    assert study.run() == []
+    settings = tmp_path / "run" / "gridworld" / "seed-2970" / "settings.json"
+    settings.write_text(settings.read_text().replace('"max_steps": 20', '"max_steps": 19'))
+    with pytest.warns(UserWarning, match=r"not read: the run directories: .* got others: max_steps 19 instead of 20$"):
+        page = write_results(tmp_path / "run")[0].read_text()
+    assert "**Values** (study `run`" in page
 
 
 @pytest.mark.slow

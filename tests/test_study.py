@@ -177,6 +177,52 @@ def test_a_finished_study_keeps_where_it_is_from_and_a_continued_one_names_both(
     assert "some trials: source older, 2026-01-01" in read_study(copy).source
 
 
+def test_trials_whose_directories_are_gone_keep_where_they_are_from(finished, tmp_path, monkeypatch):
+    without_processes(monkeypatch)
+    copy = shutil.copytree(finished, tmp_path / "study")
+    kept = json.loads((copy / "study.json").read_text()) | {"source": "older", "date": "2026-01-01"}
+    (copy / "study.json").write_text(json.dumps(kept))
+    shutil.rmtree(copy / "gridworld")
+    Study.prepare(parsed(DECLARATION, "tiny"), copy).run()
+    now = json.loads((copy / "study.json").read_text())
+    assert [(part["source"], part["date"]) for part in now["earlier"]] == [("older", "2026-01-01")]
+
+
+def test_what_may_change_of_a_finished_study_is_kept(finished, tmp_path):
+    copy = shutil.copytree(finished, tmp_path / "study")
+    before = json.loads((copy / "study.json").read_text())
+    text = "report_at = [2]\n" + DECLARATION
+    assert Study.prepare(parsed(text, "tiny"), copy).run() == []
+    assert (copy / "study.toml").read_text() == text
+    assert json.loads((copy / "study.json").read_text()) == before
+
+
+def test_a_trial_in_place_of_one_that_was_redrawn_stays_where_that_is_damaged_or_gone(tmp_path, monkeypatch):
+    without_processes(monkeypatch)
+    text = DECLARATION.split("[methods")[0]
+    study = Study.prepare(parsed(text, "tiny"), tmp_path / "study", trials=2)
+    assert study.run() == []
+    _, other = (study.rows[0].row.path(seed) for seed in (2980, 2981))
+    other.rename(other.with_name("seed-2982"))  # as if 2981 had been redrawn
+    settings = other.with_name("seed-2982") / "settings.json"
+    settings.write_text(settings.read_text().replace("2981", "2982"))
+    before = (tmp_path / "study" / "iterations.csv").read_text()
+    other.mkdir()
+    damaged = Study.prepare(parsed(text, "tiny"), tmp_path / "study", trials=2)
+    assert list(damaged.rows[0].damaged) == [2981]
+    other.rmdir()
+    assert Study.prepare(parsed(text, "tiny"), tmp_path / "study", trials=2).finished == 1
+    with pytest.raises(ValueError, match="expected more than 1, of which"):
+        Study.prepare(parsed(text, "tiny"), tmp_path / "study", trials=1)
+    assert (tmp_path / "study" / "iterations.csv").read_text() == before
+
+
+def test_a_baseline_does_not_compare_clips(tmp_path):
+    text = DECLARATION.split("[methods")[0] + "[methods.pf]\nbaseline = 'pf'\nclip_steps = 5"
+    with pytest.raises(ValueError, match="clip_steps: expected none, because a baseline compares whole"):
+        Study.prepare(parsed(text, "tiny"), tmp_path / "study")
+
+
 def test_a_row_that_hardly_ever_meets_a_preference_is_reported_and_the_others_go_on(tmp_path, monkeypatch):
     monkeypatch.setattr(rows, "MOST_SEEDS_A_TRIAL", 2)
     good = Seeds(row_of("gridworld", tmp_path / "good", TINY, seed=5, name="good"), 1)
@@ -340,7 +386,7 @@ def test_no_scheduler_is_one_line(monkeypatch, capsys, tmp_path):
 
 @contextlib.contextmanager
 def cluster(folder):
-    """A Dask scheduler and two workers, each a process; yields the address and the workers."""
+    """A Dask scheduler and two workers, each a process; yields the address and all three."""
     file = folder / "scheduler.json"
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder, "env": environment}
@@ -353,7 +399,7 @@ def cluster(folder):
         while not file.exists():
             assert time.monotonic() < waited
             time.sleep(0.1)
-        yield json.loads(file.read_text())["address"], started[1:]
+        yield json.loads(file.read_text())["address"], started
     finally:
         for process in started:
             process.kill()
@@ -364,7 +410,7 @@ def cluster(folder):
 def test_a_cluster_that_loses_a_worker_loses_no_trial_and_computes_nothing_twice(tmp_path):
     longer = TINY | {"iterations": 8}
     seeds = Seeds(row_of("gridworld", tmp_path / "row", longer, seed=5), 4)
-    with cluster(tmp_path) as (address, workers), scheduler_executor(address) as executor:
+    with cluster(tmp_path) as (address, (_, *workers)), scheduler_executor(address) as executor:
 
         def kill_one(now):  # in the middle of a trial: two iterations are on the disk, more are to come
             logs = [tmp_path / "row" / f"seed-{seed}" / "iterations" / "0002.nc" for seed in (5, 6, 7, 8)]
@@ -383,6 +429,28 @@ def test_a_cluster_that_loses_a_worker_loses_no_trial_and_computes_nothing_twice
     assert run_trial(alone, 6)
     kept, again = (runs.load(tmp_path / name / "seed-6").iterations for name in ("row", "alone"))
     assert [entry["value"] for entry in kept] == [entry["value"] for entry in again]
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_ends_the_study_and_names_its_trials(tmp_path, monkeypatch):
+    seeds = Seeds(row_of("gridworld", tmp_path / "row", TINY | {"iterations": 20}, seed=5, name="row"), 2)
+    with cluster(tmp_path) as (address, (scheduler, *_)):
+        monkeypatch.setattr("bayespbrl.studies.cluster.WAIT", 5)
+        with scheduler_executor(address) as executor:
+
+            def kill(now):
+                if any((tmp_path / "row").glob("seed-*/iterations/0001.nc")):
+                    scheduler.kill()
+
+            failures = Engine([seeds], executor, kill).run()
+    assert [str(failure) for failure in failures] == [
+        f"row seed {seed}: the connection to the scheduler is lost" for seed in (5, 6)
+    ]
+
+
+def test_a_row_is_where_it_is_for_workers_in_other_folders_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert row_of("gridworld", Path("row"), TINY, seed=5).path(5) == tmp_path / "row" / "seed-5"
 
 
 @pytest.mark.parametrize("part", ["query", "schedule", "policy"])

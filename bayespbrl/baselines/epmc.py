@@ -31,7 +31,7 @@ from jax import Array
 from jaxtyping import Float, Int, Key
 
 from bayespbrl import rollouts
-from bayespbrl.baselines.steps import Step
+from bayespbrl.baselines.steps import MOST_QUESTIONS, Step
 from bayespbrl.envs.opening import AnyEnvironment, open_environment
 from bayespbrl.experts import Expert
 from bayespbrl.policies.policy import AnyArray
@@ -46,7 +46,7 @@ EXPLORATION = 0.1  # η of EXP3
 def every_visit_preferences(
     environment: AnyEnvironment, expert: Expert, *, answers: int, seed: int, max_steps: int | None = None
 ) -> Iterator[Step]:
-    """Ask `answers` questions; yields a step with a `GridPolicy` after each.
+    """Ask until there are `answers`; yields a step with a `GridPolicy` after each.
 
     Args:
       environment: as of `Learner`; observations in a bounded `Box`, actions in a bounded `Box` of one dimension.
@@ -63,8 +63,8 @@ def every_visit_preferences(
     cells, actions = np.asarray(policy.table).shape
     better = np.full((cells, actions, actions), 0.5)  # P(a ≻ a′ | s)
     gains = np.zeros((cells, actions))  # of EXP3
-    pairs = 0
-    for number in range(1, answers + 1):
+    pairs = given = 0
+    for number in range(1, MOST_QUESTIONS * answers + 1):
         keys = jax.random.split(jax.random.key(int(np.random.default_rng([seed, number]).integers(2**31))))
         exploring, greedy = exp3(gains), best_actions(better)
         first = rollouts.rollout(
@@ -75,6 +75,8 @@ def every_visit_preferences(
         second = rollouts.rollout(environment, mixed, key=keys[1], episodes=1, max_steps=max_steps)
         shown = [first[0], second[0]]
         answer = parse_answer(expert(*shown))
+        if answer is Answer.SKIP:
+            continue
         if answer in (Answer.FIRST, Answer.SECOND):
             visited = [(policy.cells(each.states[:-1]), policy.numbers(each.actions)) for each in shown]
             preferred, other = visited if answer is Answer.FIRST else visited[::-1]
@@ -82,7 +84,10 @@ def every_visit_preferences(
             better += LEARNING_RATE * (sampled(preferred, other, better) - better)
             gains += action_values(better) / exploring  # EXP3 (Auer et al. 1995)
             pairs += 1
-        yield Step(number, pairs, policy.with_table(best_actions(better)))
+        given += 1
+        yield Step(given, pairs, policy.with_table(best_actions(better)))
+        if given == answers:
+            return
 
 
 Visits = tuple[Int[AnyArray, " t"], Int[np.ndarray, " t"]]  # cells and numbers of actions

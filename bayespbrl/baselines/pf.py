@@ -26,7 +26,7 @@ from jaxtyping import Float, Int
 from scipy.special import xlogy
 
 from bayespbrl import rollouts
-from bayespbrl.baselines.steps import Step
+from bayespbrl.baselines.steps import MOST_QUESTIONS, Step
 from bayespbrl.envs.opening import AnyEnvironment, open_environment
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.experts import Expert
@@ -41,12 +41,12 @@ DRAWS, MOVES = 300, 40  # of the posterior, and elliptical slices between two an
 def programming_by_feedback(
     environment: AnyEnvironment, expert: Expert, *, answers: int, seed: int, max_steps: int | None = None
 ) -> Iterator[Step]:
-    """Ask `answers` questions; yields a step with a `TabularPolicy` after each.
+    """Ask until there are `answers`; yields a step with a `TabularPolicy` after each.
 
     Args:
       environment: as of `Learner`; its dynamics have a `transition_table`, P(s′ | s, a) of shape (S, A, S).
       expert: answers.
-      answers: how many.
+      answers: how many. A question that is skipped has none; at most ten times as many are asked.
       seed: of everything random.
       max_steps: of a trajectory; None: the environment's limit.
 
@@ -68,17 +68,22 @@ def programming_by_feedback(
 
     start = int(np.asarray(shown(np.zeros(len(table), int), 0).states[0]))
     best = shown(planned(table, unit(points[:1]))[0], 0)
-    for number in range(1, answers + 1):
+    given = 0
+    for number in range(1, MOST_QUESTIONS * answers + 1):
         weights = unit(points)
         newcomer = shown(chosen(table, weights, visits(best, len(table)), start=start, steps=steps), number)
         answer = parse_answer(expert(newcomer, best))
+        if answer is Answer.SKIP:
+            continue
         if answer in (Answer.FIRST, Answer.SECOND):
             sign = 1.0 if answer is Answer.FIRST else -1.0
             differences.append(sign * (visits(newcomer, len(table)) - visits(best, len(table))))
             best = newcomer if answer is Answer.FIRST else best
             points = moved(points, log_likelihood(np.array(differences)), rng, moves=MOVES)
-        mean = unit(points).mean(axis=0)
-        yield Step(number, len(differences), tabular(planned(table, mean[None])[0], table.shape[1]))
+        mean, given = unit(points).mean(axis=0), given + 1
+        yield Step(given, len(differences), tabular(planned(table, mean[None])[0], table.shape[1]))
+        if given == answers:
+            return
 
 
 def preferred_probability(margins: Float[np.ndarray, "..."], width: float = ERROR_WIDTH) -> Float[np.ndarray, "..."]:

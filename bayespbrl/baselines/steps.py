@@ -4,12 +4,14 @@ from typing import NamedTuple
 
 from bayespbrl.policies.policy import Sampler
 
+MOST_QUESTIONS = 10  # for each answer, where an expert skips some
+
 
 class Step(NamedTuple):
     """The state of a baseline after an answer.
 
     Attributes:
-      answers: number of questions so far, ties and those that were skipped included.
+      answers: number so far, ties included; a question that was skipped has none.
       pairs: those that stated a preference.
       policy: what it would act by now.
     """

@@ -280,6 +280,7 @@ def results(
     out: Annotated[
         Path | None, typer.Option(help="Where to write, the study staying as it is; into its directory if omitted.")
     ] = None,
+    import_package: ImportPackage = False,
 ) -> None:
     """Write tables (Markdown, CSV) and figures of studies, with intervals and counted comparisons."""
     from bayespbrl.results import write_results
@@ -291,7 +292,7 @@ def results(
         )
     for directory, name in zip(directories, names, strict=True):
         folder = out / name if out is not None and len(directories) > 1 else out
-        page, *others = write_results(directory, folder)
+        page, *others = write_results(directory, folder, import_package=import_package)
         console.print(f"Results: {page}; {', '.join(path.name for path in others)}")
 
 

@@ -63,8 +63,11 @@ def write_predictions(study: Study, out: Path) -> list[str]:
 
 
 def _predicted(run: Path) -> tuple[list[tuple[int, int, float, bool]], str]:
-    """Question, iteration, prediction and whether "first" was answered, of each answer; what is damaged."""
-    contents = read_contents(run)
+    """Question, iteration, prediction and whether "first" was answered, of each answer; what is damaged.
+
+    The study was opened before, so that the package of its environment may be imported here too.
+    """
+    contents = read_contents(run, import_package=True)
     answers = [
         (answer.question, answer.iteration, answer.predicted, answer.answer is Answer.FIRST)
         for answer in contents.scored

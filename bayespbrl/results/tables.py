@@ -18,6 +18,7 @@ from bayespbrl.results.intervals import (
 )
 from bayespbrl.results.study_data import RowData, StudyData
 from bayespbrl.studies.declaration import AXES, DeclaredRow
+from bayespbrl.utility.inference import WITHOUT_POSTERIOR
 
 REACHED = 0.95  # of the relative value, (value − random policy) / (known reward − random policy)
 FAILED_BELOW = 0.5  # of the relative value, where the task declares no `failed_below`
@@ -80,7 +81,8 @@ def _of_trials(row: RowData, scale: tuple[float, float] | None, data: StudyData)
         "failed": MISSING,
         "exact interval": MISSING,
     }
-    if left_out := sorted(set(range(data.declaration.seed, max(row.seeds))) - set(row.seeds)):
+    beyond = data.declaration.seed + (wanted if isinstance(wanted, int) else 0)
+    if left_out := sorted(set(range(data.declaration.seed, max(max(row.seeds), beyond))) - set(row.seeds)):
         line["seeds left out"] = ", ".join(map(str, left_out))
     level = row.declared.failed_below
     if scale is not None:
@@ -183,8 +185,8 @@ def runs_table(data: StudyData) -> pd.DataFrame:
             dict(zip(AXES, row.declared.levels, strict=True))
             | {
                 "settings": options or "the default",
-                "fits": str(len(seen)),
-                "not converged": str(int((seen["converged"].astype(str) != "True").sum())),
+                "fits": MISSING if (none := _without_posterior(row)) else str(len(seen)),
+                "not converged": MISSING if none else str(int((seen["converged"].astype(str) != "True").sum())),
                 "worst R̂": _of(seen["rhat"].max(), "{:.3f}"),
                 "least ESS": _of(seen["effective_sample_size"].min(), "{:.0f}"),
                 "signal": _of(seen["signal"].median(), "{:.2f}"),
@@ -195,6 +197,10 @@ def runs_table(data: StudyData) -> pd.DataFrame:
         )
     table = pd.DataFrame(lines)
     return table.reindex(columns=_present(table)) if len(table) else table
+
+
+def _without_posterior(row: RowData) -> bool:
+    return row.declared.options.get("utility") in WITHOUT_POSTERIOR
 
 
 def kept_table(data: StudyData) -> pd.DataFrame:

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 import pandas as pd
 
+from bayespbrl.envs.opening import imported_by_name
 from bayespbrl.figures import png
 from bayespbrl.results.figures import curves_figure, profiles_figure
 from bayespbrl.results.predictions import write_predictions
@@ -23,7 +24,7 @@ from bayespbrl.results.tables import (
     values_table,
 )
 from bayespbrl.runs.files import write_file
-from bayespbrl.studies.declaration import parsed
+from bayespbrl.studies.declaration import Declaration, parsed
 from bayespbrl.studies.study import Study, read_study_json
 
 TITLES = {
@@ -51,7 +52,8 @@ NOTES = {
     "calibration": "each answer was predicted before it was given. `z` below −2: overconfident, above 2: "
     "underconfident. ECE: expected calibration error, and that of calibrated predictions, by chance.",
     "runs": "fits: posteriors over all trials and iterations. ESS: effective sample size of what mixes worst. Signal, "
-    "KL: medians over updates.",
+    "KL: medians over updates. Minutes: of estimates, updates and evaluations, without those of the "
+    "trajectories shown and of choosing the questions.",
 }  # what the columns of a table mean
 
 
@@ -60,13 +62,14 @@ def columns_of(names: Iterable[str]) -> str:
     return "\n".join(f"- **{TITLES[name]}**: {NOTES[name]}" for name in names)
 
 
-def refreshed(directory: Path, out: Path) -> tuple[StudyData, list[str]]:
+def refreshed(directory: Path, out: Path, *, import_package: bool = False) -> tuple[StudyData, list[str]]:
     """The data of a study, from its run directories where this version made them.
 
     Args:
       directory: of the study.
       out: where its tables are written anew, if they are: `directory`, or a folder of their own, which leaves it as it
         is.
+      import_package: as of `write_results`.
 
     Returns:
       the data, and what could not be read, a line each: what the tables had of it stands.
@@ -76,8 +79,15 @@ def refreshed(directory: Path, out: Path) -> tuple[StudyData, list[str]]:
     declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
     ours = description.get("version") == version("bayespbrl")
     if ours and any((directory / row.name).is_dir() for row in declaration.rows):
+        if not import_package:
+            _check_imported(directory, declaration)
         trials = description.get("trials")
-        study = Study.prepare(declaration, directory, trials=trials if isinstance(trials, int) else None)
+        try:
+            study = Study.prepare(declaration, directory, trials=trials if isinstance(trials, int) else None)
+        except ValueError as error:  # as of presets that have changed since
+            if not (directory / "iterations.csv").exists():
+                raise
+            return read_study(directory), [f"the run directories: {error}"]
         study.write_table(out)
         unread = [f"{seeds.row.path(seed)}: {why}" for seeds in study.rows for seed, why in seeds.damaged.items()]
         unread += write_predictions(study, out)
@@ -86,6 +96,16 @@ def refreshed(directory: Path, out: Path) -> tuple[StudyData, list[str]]:
     for name in ("study.json", "study.toml"):
         shutil.copy(directory / name, out / name)
     return read_study(out), unread
+
+
+def _check_imported(directory: Path, declaration: Declaration) -> None:
+    """`ValueError` where opening the study would import a package, which runs a stranger's code."""
+    for row in declaration.rows:
+        if package := imported_by_name(row.env):
+            raise ValueError(
+                f"{directory}: expected permission to import {package!r}, which {row.env} needs, got none: "
+                "import_package=True, or --import-package on the command line"
+            )
 
 
 def tables_of(data: StudyData) -> dict[str, pd.DataFrame]:
@@ -108,12 +128,13 @@ def titled(data: StudyData, name: str, table: pd.DataFrame) -> str:
     return f"**{TITLES[name]}** (study `{data.name}`{number})\n\n{markdown(table)}"
 
 
-def write_results(directory: Path | str, out: Path | str | None = None) -> list[Path]:
+def write_results(directory: Path | str, out: Path | str | None = None, *, import_package: bool = False) -> list[Path]:
     """Write `results.md`, a CSV for each table and the figures of a study.
 
     Args:
       directory: of the study, or of its four data files.
       out: where to write; None: into `directory`. Otherwise `directory` stays as it is.
+      import_package: whether a package that an environment's name has, as "package:Env-v0", may be imported.
 
     Returns:
       the files, `results.md` first.
@@ -123,7 +144,7 @@ def write_results(directory: Path | str, out: Path | str | None = None) -> list[
     """
     directory = Path(directory)
     with TemporaryDirectory() as aside:
-        data, unread = refreshed(directory, directory if out is None else Path(aside))
+        data, unread = refreshed(directory, directory if out is None else Path(aside), import_package=import_package)
     if unread:
         warnings.warn(f"not read: {'; '.join(unread)}", stacklevel=2)
     out = Path(directory if out is None else out)

@@ -16,8 +16,11 @@ BASELINE_FILE = "baseline.json"
 def measure_baseline(learner: Learner, name: str, directory: Path) -> None:
     """Run a baseline of `BASELINES` on a learner's task, with its expert and seed; in `baseline.json`.
 
-    It asks as many questions as the learner may: `answers`, or those of all iterations. The trial is written when it
+    It gets as many answers as the learner may: `answers`, or those of all iterations. The trial is written when it
     ends: one that was stopped starts again.
+
+    Raises:
+      ValueError: a task that the baseline does not take, or an expert who skipped all questions.
     """
     settings = learner.settings
     asking = settings.questions
@@ -47,6 +50,8 @@ def measure_baseline(learner: Learner, name: str, directory: Path) -> None:
             }
         )
         began = time.perf_counter()
+    if not entries:
+        raise ValueError(f"baseline {name}: expected an answer, got none: all questions were skipped")
     content = {"env": settings.env, "utility": name, "seed": settings.seed, "iterations": entries}
     write_file(directory / BASELINE_FILE, json.dumps(content, indent=1) + "\n")
 

@@ -88,6 +88,9 @@ class Engine:
             finished = wait(self._running, timeout=POLL, return_when=FIRST_COMPLETED).done
             for future in finished:
                 self._finish(future, *self._running.pop(future))
+            if not finished and _lost(self.executor):
+                self._give_up()
+                break
             self._submit_all()
             self._report()
         return self.failures
@@ -127,6 +130,14 @@ class Engine:
         if row.outcomes[seed]:
             self._report(place, seed)
 
+    def _give_up(self) -> None:
+        """All trials whose end nobody will tell; they may be continued."""
+        self.failures += [
+            Failure(self.rows[place].row, seed, "the connection to the scheduler is lost")
+            for place, seed in self._running.values()
+        ]
+        self._running.clear()
+
     def _done(self) -> int:
         return sum(len(row.with_outcome(True)) for row in self.rows)
 
@@ -139,6 +150,11 @@ class Engine:
         state.seconds = time.monotonic() - self._began
         state.latest = None if place is None else (self.rows[place].row, seed)
         self.progress(state)
+
+
+def _lost(executor: Executor) -> bool:
+    """Whether Dask's client has given its scheduler up: then its futures stay pending for ever."""
+    return getattr(getattr(executor, "_client", None), "status", None) in ("closing", "closed")
 
 
 def _died(error: BaseException) -> bool:

@@ -84,7 +84,9 @@ class Row:
         except ValueError as error:
             raise DamagedTrial(str(error)) from error
         if kept.settings != replace(self.settings, seed=seed):
-            raise ValueError(f"{path}: expected a trial with these settings, got others: {kept.settings}")
+            pairs = zip(kept.settings.options().items(), self.settings.options().values(), strict=True)
+            others = [f"{name} {kept!r} instead of {here!r}" for (name, kept), here in pairs if kept != here]
+            raise ValueError(f"{path}: expected a trial with these settings, got others: {', '.join(others)}")
         if self.untrained or self.baseline is not None:
             return True if (path / (FIRST_POLICY_FILE if self.untrained else BASELINE_FILE)).exists() else None
         if done and self.redraws(len(done), done[-1]["pairs"]):
@@ -112,6 +114,7 @@ def row_of(
     Raises:
       ValueError: an unknown environment, a bad option, an expert that is not simulated, or parts of the user's.
     """
+    directory = directory.absolute()  # workers may be elsewhere
     if directory.exists() and not directory.is_dir():
         raise ValueError(f"{directory}: expected a directory for the trials, got a file")
     checks.optional(checks.whole, "preference_within", preference_within)
@@ -204,7 +207,7 @@ def _redraws(row: Row, learner: Learner) -> bool:
 
 
 def seconds_of(row: Row, seed: int) -> float | None:
-    """The seconds that a finished trial took, without waiting for answers; None where that is not kept."""
+    """The seconds of a finished trial's estimates, updates and evaluations; None where they are not kept."""
     read = read_summary if row.baseline is None else read_baseline
     try:
         taken = [entry["seconds"] for entry in read(row.path(seed))["iterations"]]

@@ -10,6 +10,7 @@ import json
 import tomllib
 from collections.abc import Callable, Set
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -25,7 +26,7 @@ from bayespbrl.runs.files import write_file
 from bayespbrl.studies.declaration import AXES, Declaration, parsed
 from bayespbrl.studies.engine import Engine, Failure, Progress
 from bayespbrl.studies.machine import machine, rounding, source_digest
-from bayespbrl.studies.rows import Seeds, collected, row_of, seconds_of
+from bayespbrl.studies.rows import DamagedTrial, Seeds, collected, row_of, seconds_of
 from bayespbrl.studies.tables import took_place
 from bayespbrl.studies.trials import executor_for
 
@@ -90,6 +91,8 @@ class Study:
                     untrained=declared.untrained,
                     name=declared.name,
                 )
+                if declared.baseline is not None and row.settings.questions.clip_steps is not None:
+                    raise ValueError("clip_steps: expected none, because a baseline compares whole trajectories")
             except ValueError as error:
                 raise ValueError(f"study {declaration.name}, {declared.name}: {error}") from error
             seeds = Seeds(replace(row, baseline=declared.baseline), number)
@@ -144,13 +147,18 @@ class Study:
         with executor_for(jobs) as executor:
             if self.finished < self.cells or not (self.directory / "study.json").exists():
                 self._write_declaration(command)
+            else:
+                self._write_changes()
             failures = Engine(self.rows, executor, progress).run()
         self.write_table()
         return failures
 
     def _write_declaration(self, command: str) -> None:
         """`study.toml` and `study.json`, which keeps where earlier cells are from, if from elsewhere."""
-        before = read_study_json(self.directory) if self.finished else {}
+        begun = any(
+            file.exists() for file in (self.directory / "iterations.csv", *(r.row.directory for r in self.rows))
+        )
+        before = read_study_json(self.directory) if begun and (self.directory / "study.json").exists() else {}
         content: dict[str, Any] = {
             "study": self.declaration.name,
             "title": self.declaration.title,
@@ -171,6 +179,15 @@ class Study:
         self.directory.mkdir(parents=True, exist_ok=True)
         write_file(self.directory / "study.toml", self.declaration.text)
         write_file(self.directory / "study.json", json.dumps(content, indent=1) + "\n")
+
+    def _write_changes(self) -> None:
+        """What may change of a finished study: its declaration's title and levels, and the number of trials."""
+        before = read_study_json(self.directory)
+        content = before | {"title": self.declaration.title, "trials": self.trials}
+        if (self.directory / "study.toml").read_text() != self.declaration.text:
+            write_file(self.directory / "study.toml", self.declaration.text)
+        if content != before:
+            write_file(self.directory / "study.json", json.dumps(content, indent=1) + "\n")
 
     def write_table(self, out: Path | None = None) -> None:
         """Write `iterations.csv` of the finished trials; lines of those whose run directories are gone stay.
@@ -256,11 +273,17 @@ def _check_same(declaration: Declaration, directory: Path) -> None:
 
 
 def _check_no_more(seeds: Seeds) -> None:
-    """Check that a row has no more finished trials than it is to have: the table would lose them."""
-    row = seeds.row
+    """Check that a row has no more finished trials than it is to have: the table would lose them.
+
+    Where a redrawn trial is damaged or gone, the one that replaced it lies beyond the seeds, and is none too many.
+    """
+    row, more = seeds.row, 0
     beyond = row.settings.seed + len(seeds.outcomes)
     kept = (path.name.removeprefix("seed-") for path in row.directory.glob("seed-*"))
-    if any(row.outcome(seed) for seed in (int(each) for each in kept if each.isdecimal()) if seed >= beyond):
+    for seed in (int(each) for each in kept if each.isdecimal()):
+        with suppress(DamagedTrial):
+            more += seed >= beyond and bool(row.outcome(seed))
+    if more and more + len(seeds.with_outcome(True)) > seeds.trials:
         raise ValueError(f"trials: expected more than {seeds.trials}, of which {row.name} has finished more already")
 
 
