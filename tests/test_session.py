@@ -20,6 +20,7 @@ from PIL import Image, ImageDraw
 from toys import QUICK, Slope, fingerprint
 
 import bayespbrl
+from bayespbrl import events
 from bayespbrl.cli.commands import main
 from bayespbrl.cli.opening import ELSEWHERE, open_in_browser, somebody_looks
 from bayespbrl.envs.opening import open_environment
@@ -397,6 +398,47 @@ def test_the_command_line_begins_with_the_practice_unless_told(
     with pytest.raises(SystemExit) as stop:
         main()
     assert (stop.value.code, practises) == (0, [first])
+
+
+def test_an_interrupt_while_an_answer_is_kept_leaves_a_question_that_can_be_answered(sitting, monkeypatch):
+    """A notebook's kernel may be interrupted at any moment."""
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    session = sitting(learner)
+    session.wait(timeout=WAIT)
+    with session.changed:  # what follows is at hand, and shown before its events are kept
+        assert session.changed.wait_for(lambda: session.idle, WAIT)
+    kept, calls = learner.record, []
+
+    def interrupted(entry):
+        calls.append(entry)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        kept(entry)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(learner, "record", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            session.answer(session.view["turn"], "first")
+    view = session.wait(timeout=WAIT)
+    assert (view["phase"], learner.preferences.answers) == (QUESTION, 1)
+    session.answer(view["turn"], "second")
+    session.wait(timeout=WAIT)
+    assert learner.preferences.answers == 2
+
+
+def test_nobody_is_introduced_to_questions_once_all_answers_are_given(sitting):
+    learner = bayespbrl.Learner("gridworld", **QUICK | {"expert": "other", "answers": 1})
+    (query,) = learner.ask()
+    learner.record(events.answered(query.number, "first", answerer="Ada"))  # stopped before the policy caught up
+    assert not learner.finished
+    seen = []
+    session = Session(learner, answerer="Zoe", practice=True)
+    session.listen(lambda: seen.append(session.view["phase"]))
+    session.open()
+    with session.changed:
+        assert session.changed.wait_for(lambda: session.over, WAIT)
+    session.close()
+    assert set(seen) == {THINKING, FINISHED}
 
 
 def test_a_full_disk_ends_the_sitting_and_keeps_the_answers(sitting, tmp_path):

@@ -140,6 +140,28 @@ def test_a_repeated_question_that_somebody_left_takes_no_answer_beyond_the_budge
     assert (learner.preferences.answers, learner.finished) == (10, True)
 
 
+def test_who_comes_while_an_update_is_computed_lets_nobody_wait_for_it_again():
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    ahead = Foresight(learner.cycle, learner.state, lambda *_: (None, tuple(Answer)), ["Ada"], several=True)
+    computed = []
+    while learner.state.iteration < 2:
+        moment = ahead.present
+        if moment.complete:
+            number = next(iter(moment.holders))
+            learner.record(events.answered(number, Answer.FIRST, answerer="Ada"))
+            ahead.move(number, Answer.FIRST, learner.state)
+        elif (entry := ahead.compute(moment)) is not None:
+            computed.append(entry.event["event"])
+            if computed[-1] != "asked":  # another comes meanwhile, and leaves
+                ahead.gather(["Ada", "Ben"])
+                ahead.gather(["Ada"])
+            current = ahead.current(moment, entry)
+            assert current is ahead.present
+            learner.record(entry)
+            ahead.keep(current, entry)
+    assert [event for event in computed if event != "asked"] == ["collected", "improved"] * 2
+
+
 def test_the_other_ones_question_cannot_be_answered(sitting):
     session, (ada, _), (ben, _) = sitting()
     settled(session)

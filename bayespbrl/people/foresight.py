@@ -111,6 +111,23 @@ class Foresight:
         moment.holders = self._holders(moment.state, moment.holders)
         moment.entries.append(entry)
 
+    def current(self, moment: Moment, entry: Entry | None) -> Moment:
+        """The moment that an event is of which was computed for `moment`.
+
+        It is the present one where no more has changed meanwhile than who is here, and the event is the same for all:
+        nobody waits again because another came or left.
+        """
+        if entry is None or moment.state is not self.present.state:
+            return moment
+        state, settings = moment.state, self.cycle.settings
+        last = state.iteration + 1 >= settings.last_iteration(state.started)  # it ends when all have answered
+        same = entry.event["event"] == "collected" or (entry.event["event"] == "improved" and not last)
+        return self.present if same else moment
+
+    def again(self, state: LearnerState) -> None:
+        """Go on from a state: what was to follow was not all kept."""
+        self.present = self._following(self.present, state, self.present.holders)
+
     def move(self, number: int, answer: Answer, state: LearnerState) -> Moment:
         """Go to the moment after an answer, with what is computed of it.
 

@@ -189,6 +189,10 @@ class Session:
                 self.learner.record(entry)
         except Exception as error:  # a full disk, or another learner in the run: this answer is kept all the same
             self._failed(moment, error)
+        except BaseException:  # a notebook's kernel is interrupted
+            self._foresight.again(self.learner.state)
+            self._settle()
+            raise
 
     def _record(self, entry: Entry) -> None:
         """Keep what a person said; `ValueError` where the disk is full or read-only. Nothing has happened then."""
@@ -222,6 +226,7 @@ class Session:
         return None if self.over else self._foresight.pending()
 
     def _keep(self, moment: Moment, entry: Entry | None) -> None:
+        moment = self._foresight.current(moment, entry)
         if entry is not None:
             if moment is self._foresight.present:
                 self.learner.record(entry)
@@ -267,7 +272,9 @@ class Session:
     def _introducing(self, seat: Seat) -> Introduction | None:
         """What comes before the first question, while it lasts; None where there is none, or no question to come."""
         introduction = seat.introduction
-        if introduction is None or introduction.over or self._done(self._foresight.present):
+        moment = self._foresight.present
+        spent = self.learner.settings.questions.left(moment.state.preferences.answers) <= 0
+        if introduction is None or introduction.over or spent or self._done(moment):
             return None
         return introduction
 
