@@ -14,6 +14,7 @@ from bayespbrl.studies.rows import Row, Seeds, run_trial
 
 MOST_STARTS = 3  # of a trial whose process dies
 POLL = 0.5  # seconds between looks at which trials have started
+LOST = "the connection to the scheduler is lost"
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -111,8 +112,11 @@ class Engine:
         self._starts[place, seed] = self._starts.get((place, seed), 0) + 1
         try:
             self._running[self.executor.submit(run_trial, self.rows[place].row, seed)] = (place, seed)
-        except (BrokenExecutor, RuntimeError) as error:  # it takes nothing more
-            self.failures.append(Failure(self.rows[place].row, seed, f"{type(error).__name__}: {error}"))
+        except Exception as error:
+            if not (isinstance(error, BrokenExecutor | RuntimeError) or _lost(self.executor)):
+                raise
+            reason = LOST if _lost(self.executor) else f"{type(error).__name__}: {error}"  # it takes nothing more
+            self.failures.append(Failure(self.rows[place].row, seed, reason))
 
     def _finish(self, future: Future[bool], place: int, seed: int) -> None:
         row = self.rows[place]
@@ -132,10 +136,7 @@ class Engine:
 
     def _give_up(self) -> None:
         """All trials whose end nobody will tell; they may be continued."""
-        self.failures += [
-            Failure(self.rows[place].row, seed, "the connection to the scheduler is lost")
-            for place, seed in self._running.values()
-        ]
+        self.failures += [Failure(self.rows[place].row, seed, LOST) for place, seed in self._running.values()]
         self._running.clear()
 
     def _done(self) -> int:
@@ -153,7 +154,7 @@ class Engine:
 
 
 def _lost(executor: Executor) -> bool:
-    """Whether Dask's client has given its scheduler up: then its futures stay pending for ever."""
+    """Whether Dask's client has given its scheduler up: then its futures are cancelled, or stay pending for ever."""
     return getattr(getattr(executor, "_client", None), "status", None) in ("closing", "closed")
 
 
