@@ -75,13 +75,13 @@ class Cycle:
             the budget has left, and in the last iteration no more than it wants, which ends when they have answered.
             Then the result is None too.
         """
-        left = self.settings.questions.left(state.preferences.answers)
+        left = state.left(self.settings)
         if state.finished(self.settings) or (others is None and state.open and left > 0):
             return None
         if not state.collected:
             return self.collect(state)
         newcomers = self._newcomers(state)
-        last = state.iteration + 1 >= self.settings.last_iteration(state.started)
+        last = state.in_last_iteration(self.settings)
         if not state.wanted or left <= 0 or not (newcomers or others):
             return None if last and others else self.improve(state)
         if others and (not newcomers or others >= (min(left, state.wanted) if last else left)):

@@ -313,7 +313,7 @@ class Learner:
 
     def _waiting(self) -> list[Query]:
         """The open questions, no more than the budget has answers left."""
-        left = self.settings.questions.left(self.preferences.answers)
+        left = self.state.left(self.settings)
         return [] if self.finished else [query for place, query in enumerate(self.state.open) if place < left]
 
     def _advance(self, progress: Callable[["Learner"], None] | None = None) -> None:

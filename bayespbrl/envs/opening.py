@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -35,6 +36,15 @@ def imported_by_name(environment: object) -> str:
     """
     module = environment.rpartition(":")[0] if isinstance(environment, str) else ""
     return "" if module in sys.modules else module
+
+
+def check_permission(name: str, directory: Path) -> None:
+    """`ValueError` where opening a directory's environment by name would import a package, which runs its code."""
+    if package := imported_by_name(name):
+        raise ValueError(
+            f"{directory}: expected permission to import {package!r}, which {name} needs, got none: "
+            "import_package=True, or --import-package on the command line"
+        )
 
 
 def open_environment(environment: AnyEnvironment) -> gymnasium.Env:

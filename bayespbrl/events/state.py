@@ -99,6 +99,14 @@ class LearnerState:
         done = (self.iteration, self.preferences.answers, self.unasked)
         return not self.collected and settings.finished(*done, self.started)
 
+    def left(self, settings: Settings) -> float:
+        """How many answers the budget of a run with these settings has left; infinity without one."""
+        return settings.questions.left(self.preferences.answers)
+
+    def in_last_iteration(self, settings: Settings) -> bool:
+        """Whether no iteration follows the one that is begun or about to begin."""
+        return self.iteration + 1 >= settings.last_iteration(self.started)
+
     def restarts(self, settings: Settings) -> bool:
         """Whether the next trajectories follow the first policy again."""
         return self.restart is None and settings.restarts(self.iteration, self.preferences.answers, self.unasked)

@@ -119,8 +119,7 @@ class Foresight:
         """
         if entry is None or moment.state is not self.present.state:
             return moment
-        state, settings = moment.state, self.cycle.settings
-        last = state.iteration + 1 >= settings.last_iteration(state.started)  # it ends when all have answered
+        last = moment.state.in_last_iteration(self.cycle.settings)  # it ends when all have answered
         same = entry.event["event"] == "collected" or (entry.event["event"] == "improved" and not last)
         return self.present if same else moment
 
@@ -167,7 +166,7 @@ class Foresight:
         once it is spent nobody looks at any, and one that somebody has left open stays open.
         """
         settings = self.cycle.settings
-        left = settings.questions.left(state.preferences.answers)
+        left = state.left(settings)
         if state.finished(settings) or left <= 0:
             return {}
         waiting = {query.number: query for query in state.open}
@@ -181,7 +180,7 @@ class Foresight:
 
     def _left(self, moment: Moment) -> float:
         """Number of answers left in the budget."""
-        return self.cycle.settings.questions.left(moment.state.preferences.answers)
+        return moment.state.left(self.cycle.settings)
 
     def _ahead(self) -> Iterator[Moment]:
         """The moments after each answer, and those after two likely ones.

@@ -273,7 +273,7 @@ class Session:
         """What comes before the first question, while it lasts; None where there is none, or no question to come."""
         introduction = seat.introduction
         moment = self._foresight.present
-        spent = self.learner.settings.questions.left(moment.state.preferences.answers) <= 0
+        spent = moment.state.left(self.learner.settings) <= 0
         if introduction is None or introduction.over or spent or self._done(moment):
             return None
         return introduction

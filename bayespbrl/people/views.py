@@ -43,7 +43,7 @@ NOTHING_SAID: View = {"worth": None, "sure": None, "advice": ""}
 
 def described(learner: Learner, state: LearnerState, phase: str, *, turn: int, answerer: str | None) -> dict[str, Any]:
     """A view of a phase without a question: the run, and who answers."""
-    given_all = learner.settings.questions.left(state.preferences.answers) <= 0
+    given_all = state.left(learner.settings) <= 0
     return {
         "phase": phase,
         "turn": turn,

@@ -180,12 +180,12 @@ def runs_table(data: StudyData) -> pd.DataFrame:
             continue
         seen = row.lines
         options = " ".join(f"{name}={value}" for name, value in sorted(row.declared.options.items()))
-        share = seen["kl"] / seen["kl_bound"]
+        share, none = seen["kl"] / seen["kl_bound"], row.declared.options.get("utility") in WITHOUT_POSTERIOR
         lines.append(
             dict(zip(AXES, row.declared.levels, strict=True))
             | {
                 "settings": options or "the default",
-                "fits": MISSING if (none := _without_posterior(row)) else str(len(seen)),
+                "fits": MISSING if none else str(len(seen)),
                 "not converged": MISSING if none else str(int((seen["converged"].astype(str) != "True").sum())),
                 "worst R̂": _of(seen["rhat"].max(), "{:.3f}"),
                 "least ESS": _of(seen["effective_sample_size"].min(), "{:.0f}"),
@@ -197,10 +197,6 @@ def runs_table(data: StudyData) -> pd.DataFrame:
         )
     table = pd.DataFrame(lines)
     return table.reindex(columns=_present(table)) if len(table) else table
-
-
-def _without_posterior(row: RowData) -> bool:
-    return row.declared.options.get("utility") in WITHOUT_POSTERIOR
 
 
 def kept_table(data: StudyData) -> pd.DataFrame:

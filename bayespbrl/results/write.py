@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 import pandas as pd
 
-from bayespbrl.envs.opening import imported_by_name
+from bayespbrl.envs.opening import check_permission
 from bayespbrl.figures import png
 from bayespbrl.results.figures import curves_figure, profiles_figure
 from bayespbrl.results.predictions import write_predictions
@@ -24,7 +24,7 @@ from bayespbrl.results.tables import (
     values_table,
 )
 from bayespbrl.runs.files import write_file
-from bayespbrl.studies.declaration import Declaration, parsed
+from bayespbrl.studies.declaration import parsed
 from bayespbrl.studies.study import Study, read_study_json
 
 TITLES = {
@@ -79,8 +79,8 @@ def refreshed(directory: Path, out: Path, *, import_package: bool = False) -> tu
     declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
     ours = description.get("version") == version("bayespbrl")
     if ours and any((directory / row.name).is_dir() for row in declaration.rows):
-        if not import_package:
-            _check_imported(directory, declaration)
+        for row in () if import_package else declaration.rows:
+            check_permission(row.env, directory)
         trials = description.get("trials")
         try:
             study = Study.prepare(declaration, directory, trials=trials if isinstance(trials, int) else None)
@@ -96,16 +96,6 @@ def refreshed(directory: Path, out: Path, *, import_package: bool = False) -> tu
     for name in ("study.json", "study.toml"):
         shutil.copy(directory / name, out / name)
     return read_study(out), unread
-
-
-def _check_imported(directory: Path, declaration: Declaration) -> None:
-    """`ValueError` where opening the study would import a package, which runs a stranger's code."""
-    for row in declaration.rows:
-        if package := imported_by_name(row.env):
-            raise ValueError(
-                f"{directory}: expected permission to import {package!r}, which {row.env} needs, got none: "
-                "import_package=True, or --import-package on the command line"
-            )
 
 
 def tables_of(data: StudyData) -> dict[str, pd.DataFrame]:

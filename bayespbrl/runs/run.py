@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import checks, rollouts
-from bayespbrl.envs.opening import AnyEnvironment, identity, imported_by_name, made_again
+from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, made_again
 from bayespbrl.envs.spaces import check_of_space, from_plain, given_to_plain
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
@@ -73,7 +73,8 @@ def resume(
         directory that is no run or cannot be written, or a file in it that is truncated or foreign.
     """
     log = RunDirectory.open(directory)
-    _check_import(log, env, import_package)
+    if env is None and not import_package:
+        check_permission(log.settings.env, log.path)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
     try:
         log.drop_partial_line()
@@ -98,20 +99,13 @@ def load(
     A schedule and a query rule of your own are needed only to continue a run, not to read it.
     """
     log = RunDirectory.open(directory)
-    _check_import(log, env, import_package)
+    if env is None and not import_package:
+        check_permission(log.settings.env, log.path)
     if log.settings.update.schedule == "other" and schedule is None:
         schedule = ConstantBound()
     if log.settings.questions.query == "other" and query is None:
         query = highest_utility
     return Run(log.path, _restored(log, env, features=features, policy=policy, schedule=schedule, query=query))
-
-
-def _check_import(log: RunDirectory, env: AnyEnvironment | None, permitted: bool) -> None:
-    if env is None and not permitted and (package := imported_by_name(log.settings.env)):
-        raise ValueError(
-            f"{log.path}: expected permission to import {package!r}, which {log.settings.env} needs, got none: "
-            "import_package=True, or --import-package on the command line"
-        )
 
 
 def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Learner:

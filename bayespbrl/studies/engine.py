@@ -113,9 +113,10 @@ class Engine:
         try:
             self._running[self.executor.submit(run_trial, self.rows[place].row, seed)] = (place, seed)
         except Exception as error:
-            if not (isinstance(error, BrokenExecutor | RuntimeError) or _lost(self.executor)):
+            lost = _lost(self.executor)
+            if not (lost or isinstance(error, BrokenExecutor | RuntimeError)):
                 raise
-            reason = LOST if _lost(self.executor) else f"{type(error).__name__}: {error}"  # it takes nothing more
+            reason = LOST if lost else f"{type(error).__name__}: {error}"  # it takes nothing more
             self.failures.append(Failure(self.rows[place].row, seed, reason))
 
     def _finish(self, future: Future[bool], place: int, seed: int) -> None:
