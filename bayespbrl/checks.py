@@ -1,6 +1,6 @@
 """Checks of arguments, one for each kind: a `ValueError` says which argument it is, what was expected and what came."""
 
-import math
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -105,9 +105,12 @@ def finite(name: str, values: Any) -> None:
 def matrix(name: str, values: Any, *, columns: int | None = None) -> np.ndarray:
     """`values` as a finite float64 array of shape (N, columns); any number of columns when None."""
     try:
-        array = np.asarray(values, dtype=np.float64)
+        given = np.asarray(values)
+        array = np.asarray(given.real, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected rows of numbers, all equally long, got {_shortened(values)}") from error
+    if np.ma.is_masked(values) or np.iscomplexobj(given):
+        raise ValueError(f"{name}: expected real numbers, got masked or complex entries")
     if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
         raise ValueError(f"{name}: expected shape (N, {'D' if columns is None else columns}), got {array.shape}")
     finite(name, array)
@@ -169,4 +172,4 @@ def _shortened(values: Any) -> str:
 
 def _is_number(value: Any) -> bool:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return number and math.isfinite(value)
+    return number and -sys.float_info.max <= value <= sys.float_info.max  # a whole number may be larger than any float

@@ -331,7 +331,7 @@ class Cycle:
         improved = apply_update(
             proposed,
             bound.kl_bound * (1.0 if check is None else check.trust),
-            key=key,
+            key=key,  # which the first proposal split: its half is the parent of the next proposal's
             rng=self._rng(IMPROVE, iteration),
             updates=settings.update.updates_per_iteration,
         )

@@ -28,7 +28,7 @@ def parse_answer(answer: object) -> Answer:
         return Answer(answer)  # type: ignore[arg-type]
     except ValueError:
         choices = ", ".join(repr(str(choice)) for choice in Answer)
-        raise ValueError(f"expert: expected one of {choices}, got {answer!r}") from None
+        raise ValueError(f"answer: expected one of {choices}, got {answer!r}") from None
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,7 @@ def test_features_that_are_suddenly_more(tmp_path, straight, calls_an_iteration)
 
 
 def test_an_expert_that_returns_nonsense(tmp_path, straight):
-    message = "expert: expected one of 'first', 'second', 'tie', .*, got "
+    message = "answer: expected one of 'first', 'second', 'tie', .*, got "
     learner = stopped(tmp_path / "run", message, expert=Faulty(ReturnExpert(), lambda first, second: "perhaps", 3))
     for answer in ("perhaps", None, 1, ["first"], np.nan, True):
         fails_again(learner, message, expert=Faulty(ReturnExpert(), lambda first, second, a=answer: a, 0))

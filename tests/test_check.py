@@ -14,6 +14,8 @@ NOISE = np.array([-1.0, 1.0, -0.5, 0.5])
         (0.2, 0.5, (7, 1.0, False)),  # a step forward
         (0.2, 0.05, (7, 0.1, False)),
         (-0.2, 0.5, (3, 0.5, False)),  # within the error: it goes on, and the best stays
+        (-0.4, 0.5, (3, 0.5, False)),
+        (-0.6, 0.5, (3, 0.25, True)),  # the standard error is 0.46
         (0.0, 0.5, (3, 0.5, False)),
         (-2.0, 0.5, (3, 0.25, True)),  # a step back
         (-2.0, 0.06, (3, LEAST_TRUST, True)),

@@ -150,6 +150,12 @@ def test_resuming_draws_the_pictures_that_a_finished_run_lacks(monkeypatch, caps
     assert (out / "events.jsonl").read_bytes() == before
 
 
+def test_an_interrupt_while_the_pictures_are_drawn_says_how_to_get_them(monkeypatch, capsys, tmp_path):
+    with mock.patch("bayespbrl.cli.display._film", side_effect=KeyboardInterrupt):
+        assert call(monkeypatch, "run", "gridworld", *QUICK, "--out", tmp_path / "run") == 130
+    assert f"Nothing is lost: bayespbrl resume {tmp_path / 'run'}" in capsys.readouterr().out.replace("\n", "")
+
+
 def test_nobody_answers_for_an_expert_of_the_users_own(monkeypatch, capsys, tmp_path):
     assert "expert: expected a simulated expert, page or terminal, got other" in refused(
         monkeypatch, capsys, "run", "gridworld", *QUICK, "--expert", "other", "--out", tmp_path / "run"

@@ -236,7 +236,14 @@ def test_a_task_whose_observations_have_parts_is_learned_and_acted_in(tmp_path):
     observation, _ = gymnasium.make("Blackjack-v1").reset(seed=0)
     policy = bayespbrl.load(tmp_path / "run").policy
     assert policy.act(observation) in (0, 1)
-    assert policy.predict(observation, deterministic=True)[0] in (0, 1)
+    one, _ = policy.predict(observation, deterministic=True)
+    assert one in (0, 1)
+    batch = tuple(
+        np.array([part, other]) for part, other in zip(observation, (4, 10, 0), strict=True)
+    )  # as copies give
+    actions, _ = policy.predict(batch, deterministic=True)
+    other, _ = policy.predict((4, 10, 0), deterministic=True)
+    assert actions.tolist() == [one, other]
     for wrong in (3, {"hand": 3}, (40, 1)):
         with pytest.raises(ValueError, match=r"observation: expected one of Tuple\(Discrete\(32\), .*, got "):
             policy.act(wrong)

@@ -88,7 +88,7 @@ def test_a_seed_that_is_no_whole_number_is_refused(seed):
 
 
 def test_nonsense_of_the_expert_within_is_named():
-    with pytest.raises(ValueError, match=r"expert: expected one of .*, got 'left'"):
+    with pytest.raises(ValueError, match=r"answer: expected one of .*, got 'left'"):
         NoisyExpert(lambda a, b: "left", 0.1)(trajectory([1.0]), trajectory([0.0], 1))
 
 

@@ -115,7 +115,7 @@ def test_everything_together_agrees_with_quadrature():
     expected, evidence = quadrature(SETTINGS)
     agree(tree, expected)
     assert tree.attrs["converged"]
-    assert abs(tree.attrs["log_evidence"] - evidence) < 4 * tree.attrs["log_evidence_error"] + 1e-3
+    assert abs(tree.attrs["log_evidence"] - evidence) < 4 * tree.attrs["log_evidence_error"] + 1e-3 < 0.5
 
 
 @pytest.mark.slow
@@ -124,7 +124,7 @@ def test_answers_that_contradict_each_other_agree_with_quadrature_where_expectat
     tree = sample_posterior(settings, **INFERRED, **SAMPLING)
     expected, evidence = quadrature(settings)
     agree(tree, expected)
-    assert abs(tree.attrs["log_evidence"] - evidence) < 4 * tree.attrs["log_evidence_error"] + 1e-3
+    assert abs(tree.attrs["log_evidence"] - evidence) < 4 * tree.attrs["log_evidence_error"] + 1e-3 < 0.5
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_ties_with_an_unknown_threshold_agree_with_quadrature():
     tree = sample_posterior(SETTINGS, **INFERRED, indifferent=tied, **SAMPLING)
     expected, evidence = quadrature(SETTINGS, tied=tied)
     agree(tree, expected)
-    assert abs(tree.attrs["log_evidence"] - evidence) < 4 * tree.attrs["log_evidence_error"] + 1e-3
+    assert abs(tree.attrs["log_evidence"] - evidence) < 4 * tree.attrs["log_evidence_error"] + 1e-3 < 0.5
 
 
 @pytest.mark.slow
@@ -229,6 +229,8 @@ def test_names_are_kept_by_number_also_of_whom_no_answer_is_left():
     rows, sides = SETTINGS[0], np.array([1, -1, 1, 1])
     answers = Answers(None, sides, ["Bob", "Ada", "Ada", "Bob"]).checked(4)
     assert (answers.answerers.tolist(), answers.names) == ([0, 1, 1, 0], ("Bob", "Ada"))
+    numbered = Answers(answerers=[7, 2, 2, 7]).checked(4)  # nobody is 0, 1 or 3 to 6
+    assert (numbered.answerers.tolist(), numbered.names) == ([1, 0, 0, 1], ("2", "7"))
     only = answers.of([0, 3])
     tree = posterior_draws(rows[[0, 3]], PreferenceModel(lapse_rate=None), seed=1, answers=only)
     drawn = restored(stored(tree))["posterior"].dataset

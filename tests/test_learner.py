@@ -304,7 +304,7 @@ def test_what_is_no_answer_is_refused_and_nothing_has_happened(answers):
     run, log = remembered()
     run.ask()
     state, length = run.state, len(log.entries)
-    with pytest.raises(ValueError, match=r"tell: expected a list of 1|expert: expected one of"):
+    with pytest.raises(ValueError, match=r"tell: expected a list of 1|answer: expected one of"):
         run.tell(answers)
     assert run.state is state
     assert len(log.entries) == length
@@ -314,7 +314,7 @@ def test_what_is_no_answer_is_refused_and_nothing_has_happened(answers):
 
 def test_an_expert_that_answers_nonsense_is_named_and_can_be_replaced(straight):
     run = learner()
-    with pytest.raises(ValueError, match=r"expert: expected one of 'first', .*, got 'perhaps'"):
+    with pytest.raises(ValueError, match=r"answer: expected one of 'first', .*, got 'perhaps'"):
         run.run(lambda first, second: "perhaps")
     assert fingerprint(run.run(ReturnExpert())) == straight
 

@@ -66,6 +66,15 @@ def test_the_sums_of_two_blocks_are_those_of_all_transitions():
     assert np.abs(solve_lstd(first, **options) - expected).max() > 1e-3
 
 
+@pytest.mark.parametrize("kind", [bool, np.uint8, np.int8])
+def test_features_of_few_bits_are_summed_as_numbers(kind):
+    rng = np.random.default_rng(0)
+    features, following = rng.integers(0, 2, (2, 600, 3)).astype(kind)
+    utilities, options = rng.normal(size=600), {"discount": 0.8, "fixed_point_ridge": 0.1, "projection_ridge": 0.1}
+    expected = lstd(features.astype(float), following.astype(float), utilities, **options)
+    np.testing.assert_array_equal(lstd(features, following, utilities, **options), expected)
+
+
 def test_features_that_never_occur_get_weight_zero():
     features, following = chain_features(3)
     padded = [np.column_stack([block, np.zeros(3)]) for block in (features, following)]

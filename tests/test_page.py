@@ -467,8 +467,11 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
     foreign = {"Origin": "http://example.org"}
     for host in ("127.0.0.1", "LOCALHOST"):  # a name in any case
         assert call(gridworld, "GET", f"{token}/", Host=f"{host}:{gridworld.port}")[0] == 200
-    for path in ("/", "/answer", "/events", "/wrong/", f"/{gridworld.token[:-1]}/", f"{token}"):
+    for path in ("/", "/answer", "/events", "/wrong/", f"/{gridworld.token[:-1]}/", token[:-1]):
         assert call(gridworld, "GET", path)[0] == 403
+    assert call(gridworld, "GET", token)[0] == 307  # to the address with its last slash
+    assert call(gridworld, "GET", token, Host="example.org")[0] == 403
+    assert call(gridworld, "POST", token, good)[0] == 403
     assert call(gridworld, "POST", "/wrong/answer", good)[0] == 403
     assert call(gridworld, "POST", f"{token}/answer", good, **foreign)[0] == 403
     assert call(gridworld, "POST", f"{token}/answer", good, Host="example.org")[0] == 403
@@ -488,6 +491,7 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
         json.dumps({"turn": turn, "answer": "first", "seconds": -1}),
         json.dumps({"turn": turn, "answer": "first", "seconds": float("nan")}),
         json.dumps({"turn": turn, "answer": "first", "seconds": "long"}),
+        json.dumps({"turn": turn, "answer": "first", "seconds": 10**400}),
         json.dumps({"turn": turn, "answer": "first", "replays": -1}),
         json.dumps({"turn": turn, "answer": "first", "replays": 1e9}),
         json.dumps({"turn": turn, "answer": "first", "more": 1}),

@@ -109,6 +109,13 @@ def test_each_draw_predicts_by_its_own_setting_steepness_and_lapse_rate():
 
 
 @pytest.mark.slow
+def test_where_the_model_rules_out_every_order_neither_is_likelier():
+    differences, first = np.array([[1.0, 0.0], [0.5, 1.0]]), np.array([True, False])
+    model = PreferenceModel(tie_threshold=200.0)
+    predicted = prequential_predictions(differences, first, model, answers=Answers(np.array([True, True])))
+    np.testing.assert_array_equal(predicted, 0.5)
+
+
 def test_without_answers_the_prior_predicts():
     nothing, everything = np.zeros(5, dtype=bool), np.ones(5, dtype=bool)
     model = PreferenceModel(steepness=2.0, tie_threshold=0.4, likelihood="probit", prior_scale=0.7)

@@ -45,6 +45,13 @@ def test_ties_are_counted_where_they_are_possible_and_a_pair_asked_twice_can_con
     assert result["observed"].sel(check="cycles") == 1
 
 
+def test_an_answer_about_two_equal_things_cannot_surprise():
+    result = predictive_checks(sample_posterior(np.array([[1.0, 0.0], [0.0, 0.0]]), **OPTIONS))
+    assert result["possible"].sel(check="surprises") == 1
+    nothing = predictive_checks(sample_posterior(np.zeros((2, 2)), **OPTIONS))
+    assert np.isnan(nothing["p_value"].sel(check="surprises"))
+
+
 def test_no_answer_leaves_nothing_to_check():
     result = predictive_checks(sample_posterior(np.zeros((0, 2)), **OPTIONS))
     assert np.all(result["possible"] == 0)

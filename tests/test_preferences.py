@@ -116,5 +116,5 @@ def test_answers_are_recognised_and_anything_else_is_refused_by_name():
     assert parse_answer("tie") is Answer.TIE
     assert parse_answer(Answer.UNDO) is Answer.UNDO
     for nonsense in ("both", 1, None, "FIRST", ["first"], float("nan")):
-        with pytest.raises(ValueError, match="expert: expected one of 'first'"):
+        with pytest.raises(ValueError, match="answer: expected one of 'first'"):
             parse_answer(nonsense)

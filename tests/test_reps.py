@@ -131,6 +131,41 @@ def test_bad_arrays_are_named():
         reps_weights(np.where(q_values > 3, np.nan, q_values), features, base, kl_bound=0.1)
     with pytest.raises(ValueError, match="base_weights"):
         reps_weights(q_values, features, 2 * base, kl_bound=0.1)
+    with pytest.raises(ValueError, match=r"state_features: expected shape \(N, D\), got \(18,\)"):
+        reps_weights(q_values, features[:, 0], base, kl_bound=0.1)
+    with pytest.raises(ValueError, match="N > 0, got"):
+        reps_weights([], np.zeros((0, 1)), [], kl_bound=0.1)
+
+
+@pytest.mark.parametrize(("spread", "leaves"), [(1e-5, False), (1e-10, True)])
+def test_a_q_that_differs_by_rounding_alone_leaves_the_policy_as_it_is(spread, leaves):
+    q_values, features, base = random_problem()
+    solution = reps_weights(
+        1.0 + spread * (q_values - base @ q_values) / np.std(q_values), features, base, kl_bound=0.3
+    )
+    assert (solution.status == reps.CONSTANT) == leaves
+    assert (solution.kl == pytest.approx(0.3, rel=1e-3)) != leaves
+    advantage = advantages(1.0 + spread * q_values, whitened(features, base), base)
+    assert (not advantage.any()) == leaves
+
+
+def test_the_largest_directions_are_kept_and_none_below_the_tolerance():
+    rng = np.random.default_rng(2)
+    features = rng.normal(size=(500, 4)) * [1.0, 10.0, 1.2e-2, 5e-3]
+    base = np.full(500, 1 / 500)
+    kept = whitened(features, base)
+    assert kept.features.shape[1] == 3  # a thousandth of the largest is the least
+    largest = whitened(features, base, most=1)
+    assert largest.features.shape[1] == 1
+    assert abs(np.corrcoef(largest.features[:, 0], features[:, 1])[0, 1]) > 0.999
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1.0, 1e3, 1e20])
+def test_features_are_whitened_whatever_their_unit_and_a_constant_is_none(scale):
+    q_values, features, base = random_problem()
+    assert whitened(scale * features, base).features.shape[1] == whitened(features, base).features.shape[1] == 5
+    constant = reps_weights(q_values, np.full((len(base), 1), scale), base, kl_bound=0.1)
+    assert (constant.rank_kept, constant.converged) == (0, True)
 
 
 def test_a_solver_that_fails_leaves_the_policy_as_it_is_and_says_so(monkeypatch):
@@ -227,5 +262,15 @@ def test_state_by_state_bad_input_is_refused():
             reps_weights_by_state(*arguments, kl_bound=0.3)
     with pytest.raises(ValueError, match=r"states: expected each of 0 … 6, got no 2"):
         reps_weights_by_state(q_values, states + (states >= 2), base, kl_bound=0.3)
+    for wrong in (states - 1, states + 0.5, np.eye(18, dtype=int)):
+        with pytest.raises(ValueError, match="states: expected whole numbers from 0"):
+            reps_weights_by_state(q_values, wrong, base, kl_bound=0.3)
     with pytest.raises(ValueError, match="kl_bound"):
         reps_weights_by_state(q_values, states, base, kl_bound=0.0)
+
+
+def test_state_by_state_a_bound_below_rounding_changes_nothing():
+    for seed in range(40):
+        q_values, states, base = by_state(random_problem(states=17, seed=seed))
+        solution = reps_weights_by_state(q_values, states, base, kl_bound=1e-20)
+        np.testing.assert_allclose(solution.sample_weights, 1.0, rtol=1e-6)

@@ -744,6 +744,27 @@ def test_a_run_goes_on_in_no_other_environment_than_its_own(tmp_path):
         assert bayespbrl.load(tmp_path / "run", env=same).settings.env == "Pendulum-v1"
 
 
+def test_an_object_keeps_the_time_limit_that_it_was_started_with(tmp_path):
+    def carts(limit):
+        return gymnasium.make("CartPole-v1", max_episode_steps=limit)
+
+    options = QUICK | {"utility": "linear-program", "iterations": 3}
+    whole = bayespbrl.Learner(carts(8), **options).run(ReturnExpert())
+    assert max(map(len, whole.trajectories)) == 8
+    learner = bayespbrl.start(carts(8), tmp_path / "run", **options)
+    learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    assert fingerprint(runs.resume(tmp_path / "run", env=carts(500)).run(ReturnExpert())) == fingerprint(whole)
+    for read in (bayespbrl.load, runs.resume):
+        with pytest.raises(ValueError, match="run: env: expected a time limit of 8 steps or more, got 7"):
+            read(tmp_path / "run", env=carts(7))
+
+
+def test_all_that_only_python_can_give_is_asked_for_at_once(tmp_path):
+    bayespbrl.start(Corridor(), tmp_path / "run", features=rows, utility="linear-program", max_steps=5)
+    with pytest.raises(ValueError, match=r"expected env=, features= again, .* got None \(only Python can give it\)"):
+        bayespbrl.resume(tmp_path / "run")
+
+
 def test_arguments_that_are_arrays_are_compared():
     kwargs = {"goal": np.array([1.0, 2.0]), "render_mode": None}
     gymnasium.register("Goal-v0", entry_point=lambda goal, render_mode: Corridor(), kwargs=kwargs, max_episode_steps=5)

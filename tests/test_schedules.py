@@ -110,6 +110,7 @@ def test_a_posterior_that_has_not_converged_never_raises_the_bound():
     mean = proposed().q_values
     update = proposed(np.column_stack([mean] * 10))
     assert ConfidenceBound()(situation(update, converged=False)).kl_bound == 0.35
+    assert ConfidenceBound()(situation(update, converged=False, usual=0.6)).kl_bound == 0.6
     assert ConfidenceBound()(situation(update, converged=False, usual=0.05)).kl_bound == 0.05
     assert "not converged" in ConfidenceBound()(situation(update, converged=False)).reason
     at_odds = proposed(np.column_stack([mean, -0.5 * mean]))

@@ -228,7 +228,7 @@ def test_a_turn_takes_one_answer_and_an_undo_is_a_turn_of_its_own(sitting):
     again = session.wait(timeout=WAIT)
     assert (second["answered"], again["turn"], again["answered"]) == (1, 3, 0)
     assert again["clips"] == first["clips"]
-    with pytest.raises(ValueError, match="expert: expected one of"):
+    with pytest.raises(ValueError, match="answer: expected one of"):
         session.answer(3, "left")
     session.answer(3, "second")
     view = answer_all(session, lambda first, second: "tie")
@@ -285,7 +285,7 @@ def test_practice_comes_before_the_first_question_of_a_person_and_records_nothin
     assert turns == [2, 3, 4, 5, 6]
     assert "From now on your answers are kept" in view["notice"]
     assert not view["undo"]
-    with pytest.raises(ValueError, match="expert: expected one of"):
+    with pytest.raises(ValueError, match="answer: expected one of"):
         session.answer(6, "begin")
     events = [line.split('"')[3] for line in learner.log.log_file.read_text().splitlines()]
     assert events == ["collected", "asked"]

@@ -357,6 +357,12 @@ def test_features_that_are_not_finite_are_refused():
             estimate_utility(TRAJECTORIES, PAIRS, lambda s: ONE_HOT(s) * np.nan, method=method, discount=0.9)
 
 
+def test_an_evidence_that_cannot_be_told_is_none():
+    estimate = infer_utility([[1.0], [0.0]], [(0, 1), (1, 0)], steepness=1e6, lapse_rate=0.0)
+    assert estimate.posterior.attrs["log_evidence_error"] == np.inf
+    assert np.isnan(estimate.quality.log_evidence)
+
+
 ITEMS = np.array([[2.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 BAD_ARGUMENTS = [
     ({"feature_sums": [{1: 2}]}, "feature_sums: expected rows of numbers"),
@@ -378,7 +384,12 @@ BAD_ARGUMENTS = [
     ({"discount": 5}, r"discount: expected a number in \[0, 1\], got 5"),
     ({"features": 3}, "features: expected a function of states"),
     ({"seed": "x"}, "seed: expected a whole number >= 0"),
-    ({"answerers": ["a", "b"]}, "answerers: expected 1 whole numbers"),
+    ({"feature_sums": np.ma.masked_less(ITEMS, 1)}, "feature_sums: expected real numbers, got masked or complex"),
+    ({"feature_sums": np.asarray(ITEMS) * 1j}, "feature_sums: expected real numbers, got masked or complex"),
+    ({"prior_scale": 10**400}, "prior_scale: expected"),
+    ({"answerers": ["a", "b"]}, "answerers: expected 1 names, one for each answer"),
+    ({"answerers": [None]}, "answerers: expected 1 whole numbers"),
+    ({"answerers": [-1]}, "answerers: expected 1 whole numbers"),
     ({"shown_first": [7]}, "shown_first: expected 1 whole numbers in -1 … 1"),
     ({"lapse_rate": 7}, "lapse_rate: expected a number"),
     ({"prior_scale": -1.0}, "prior_scale: expected a positive"),

@@ -52,10 +52,10 @@ def run_to_the_end(
             learner.run(person, answerer=next(iter(answerers), None), progress=lambda now: console.print(_state(now)))
         else:
             _run_with_bar(learner, _simulated(learner, directory))
+        show_run(learner, directory)
     except KeyboardInterrupt:
         console.print(f"\nStopped. Nothing is lost: {_again('resume', directory, answerers)}")
         raise
-    show_run(learner, directory)
 
 
 def _again(command: str, directory: Path, answerers: Sequence[str]) -> str:

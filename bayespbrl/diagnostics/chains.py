@@ -82,7 +82,9 @@ def plot_ranks(tree: xr.DataTree, axes: Axes, *, preference: int | None = None, 
     Source: Vehtari et al. (2021), section 4.2.
     """
     margins = np.asarray(tree["posterior"]["margins"])
-    if preference is None and margins.shape[2]:
+    if not margins.shape[2]:
+        raise ValueError("tree: expected a posterior of at least one answer, got none")
+    if preference is None:
         preference = int(np.argmax(chain_convergence(margins).rhat))
     preference = checks.index("preference", preference, margins.shape[2])
     draws = margins[:, :, preference]

@@ -35,7 +35,8 @@ def predicted_answer(
         know, or None, has the lapse rate of all of them together, and no side bias.
 
     Returns:
-      that, and the probability that either is preferred: 1 where nobody called two equal so far.
+      that, ½ where the model rules out that either is, and the probability that either is preferred: 1 where nobody
+      called two equal so far.
     """
     estimate, posterior = expect_posterior(estimate)
     names = answers_of(posterior).names or ()
@@ -44,4 +45,4 @@ def predicted_answer(
     differences = estimate.differences([first, second])
     chances = answer_probabilities(posterior, differences, answers)[0]
     stated = float(chances[PREFERRED] + chances[DOMINATED])
-    return float(chances[PREFERRED]) / stated, stated
+    return float(chances[PREFERRED]) / stated if stated > 0 else 0.5, stated

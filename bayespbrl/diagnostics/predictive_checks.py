@@ -47,7 +47,7 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
     simulated = _simulated(tree, margins, every, np.random.default_rng(seed))
     triads = _triads(settings_of(tree.children["constant_data"].dataset["differences"].values)[0])
     counts: dict[str, tuple[np.ndarray, np.ndarray, int]] = {
-        "surprises": (_surprises(given, margins), _surprises(simulated, margins), number),
+        "surprises": (_surprises(given, margins), _surprises(simulated, margins), int(np.any(margins, axis=0).sum())),
         "cycles": (_cycles(given, triads), _cycles(simulated, triads), len(triads)),
         "ties": (np.sum(given == 0, axis=1), np.sum(simulated == 0, axis=1), number * ("tie_threshold" in drawn)),
     }

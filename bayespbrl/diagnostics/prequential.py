@@ -35,7 +35,8 @@ def prequential_predictions(
       model: prior and likelihood; the defaults of `PreferenceModel` when None.
       groups: the number of the answer that each row follows from, never decreasing, shape (K,): no row is used to
         predict another of its answer. Every row is an answer of its own by default.
-      answers: ties, sides and answerers of the rows. The prediction is conditional on a preference being stated.
+      answers: ties, sides and answerers of the rows. The prediction is conditional on a preference being stated,
+        ½ where the model rules that out.
       sampling_options: `seed`, `num_samples` and the like of `sample_posterior`; `number_of_preferences`, another K.
 
     Returns:
@@ -55,7 +56,8 @@ def prequential_predictions(
         )
         stated = probabilities[:, predictions.PREFERRED] + probabilities[:, predictions.DOMINATED]
         column = np.where(first_preferred[asked], predictions.PREFERRED, predictions.DOMINATED)
-        predicted[asked] = np.take_along_axis(probabilities, column[:, None], axis=1)[:, 0] / stated
+        first = np.take_along_axis(probabilities, column[:, None], axis=1)[:, 0]
+        predicted[asked] = np.divide(first, stated, out=np.full(len(first), 0.5), where=stated > 0)
     return predicted
 
 

@@ -1,9 +1,11 @@
 """Observations and actions as policies and features meet them: rows of numbers, or whole numbers from 0, and back."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple, flatten, flatten_space
+from gymnasium.vector.utils import batch_space, iterate
 
 from bayespbrl import checks
 
@@ -69,19 +71,43 @@ def to_plain(space: Space[Any], value: Any, actions: Space[Any] | None = None) -
     raise ValueError(f"observation: expected one of {space}, got {checks.one_line(value)}") from why
 
 
-def _parts_within(space: Any, value: Any) -> bool:
-    """Whether the discrete parts of an observation are of their spaces: gymnasium takes others for some that are."""
+def unbatched(space: Space[Any], value: Any) -> list[Any] | None:
+    """The observations of a batch, each of whose parts has a leading axis; None where it is no batch."""
+    try:
+        shapes = [(np.shape(each), part.shape) for part, each in _parts(space, value)]
+    except (LookupError, TypeError, ValueError):  # not of this space
+        return None
+    numbers = {shape[:1] for shape, _ in shapes}
+    if len(numbers) > 1 or any(shape[1:] != one or len(shape) != len(one) + 1 for shape, one in shapes):
+        return None
+    return list(iterate(batch_space(space, numbers.pop()[0]), value))
+
+
+def _parts(space: Any, value: Any) -> Iterator[tuple[Any, Any]]:
+    """The spaces that an observation's is made of, with what it has of each."""
     if isinstance(space, Dict):
-        return all(_parts_within(part, value[name]) for name, part in space.spaces.items())
-    if isinstance(space, Tuple):
-        return all(map(_parts_within, space.spaces, value))
+        for name, part in space.spaces.items():
+            yield from _parts(part, value[name])
+    elif isinstance(space, Tuple):
+        for part, each in zip(space.spaces, value, strict=True):
+            yield from _parts(part, each)
+    else:
+        yield space, value
+
+
+def _parts_within(space: Any, value: Any) -> bool:
+    """Whether the parts of an observation are of their spaces: gymnasium takes others for some that are."""
+    return all(_within(part, each) for part, each in _parts(space, value))
+
+
+def _within(space: Any, value: Any) -> bool:
     values = np.asarray(value)
     if isinstance(space, MultiBinary):
         return bool(np.all((values == 0) | (values == 1)))
     if isinstance(space, Discrete | MultiDiscrete):
         number = space.n if isinstance(space, Discrete) else space.nvec
         return bool(np.all((values >= space.start) & (values < space.start + number)))
-    return True
+    return not isinstance(space, Box) or values.size == np.prod(space.shape)
 
 
 def given_to_plain(space: Space[Any], value: Any, actions: Space[Any]) -> np.ndarray | np.int64:

@@ -40,7 +40,8 @@ def transition_sums(features: ArrayLike, next_features: ArrayLike, utilities: Ar
     Raises:
       ValueError: shapes that do not fit.
     """
-    features, next_features, utilities = np.asarray(features), np.asarray(next_features), np.asarray(utilities)
+    given = (features, next_features, utilities)
+    features, next_features, utilities = (np.asarray(each, dtype=np.float64) for each in given)  # sums of bytes wrap
     if (
         features.shape != next_features.shape
         or utilities.shape[:1] != features.shape[:1]
@@ -88,7 +89,9 @@ def solve_lstd(sums: TransitionSums, *, discount: float, fixed_point_ridge: floa
 
 
 def _solve_symmetric(matrix: Float[np.ndarray, "q q"], ridge: float, right: Targets) -> Targets:
-    """Solve (matrix + ridge·I) x = right for a positive semi-definite matrix; least norm where it is singular.
+    """Solve (matrix + ridge·I) x = right for a positive semi-definite matrix; of few directions where it is singular.
+
+    Where rounding hides that it is singular, the solution may be longer than the one of least norm. Its Q is the same.
 
     By NumPy and not with SciPy's Cholesky factor: SciPy brings a second BLAS, whose idle threads spin and slow down all
     that follows.

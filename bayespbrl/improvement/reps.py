@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 from bayespbrl import checks
 
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
+TEMPERATURE_CEILING = 1e9  # KL is 1e-18 there, less than its rounding
 HIGHER_FLOORS = (1e-2, 1e-1)  # where the solver does not finish near the floor
 RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
@@ -80,6 +81,8 @@ def whitened(
 ) -> WhitenedFeatures:
     """Features whitened under W, without directions below `RANK_TOLERANCE` of the largest singular value.
 
+    None are kept where only rounding tells the samples apart.
+
     Args:
       state_features, base_weights: as in `reps_weights`.
       most: of the directions that are kept, those of the largest singular values; None: all.
@@ -92,7 +95,8 @@ def whitened(
     covariance = centred.T @ (centred * base_weights[:, None])
     values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
     keep = values > max(values[-1], 0.0) * RANK_TOLERANCE**2
-    if not np.any(keep) or values[-1] <= 1e-24:
+    rounding = (1e-12 * np.max(np.abs(state_features), initial=0.0)) ** 2
+    if not np.any(keep) or values[-1] <= rounding:
         return WhitenedFeatures(np.zeros((len(centred), 0)), np.zeros((centred.shape[1], 0)))
     leading = slice(None if most is None else -most, None)  # the eigenvalues ascend
     mapping = (vectors[:, keep] / np.sqrt(values[keep]))[:, leading]
@@ -126,6 +130,8 @@ def reps_weights(
     Source: paper, eqs. 11-13; Daniel, Neumann and Peters (2012) for the feature constraint.
     """
     q, phi, base = _checked_samples(q_values, state_features, base_weights, kl_bound)
+    if phi.ndim != 2:
+        raise ValueError(f"state_features: expected shape (N, D), got {phi.shape}")
     constraint = whitened(phi, base) if constraint is None else constraint
     features = constraint.features
     mean = base @ q
@@ -178,6 +184,8 @@ def reps_weights_by_state(
     Source: paper, eqs. 11-13, in the limit of features that tell all states apart.
     """
     q, states, base = _checked_samples(q_values, states, base_weights, kl_bound)
+    if states.ndim != 1 or states.dtype.kind not in "iu" or np.any(states < 0):
+        raise ValueError(f"states: expected whole numbers from 0, shape (N,), got {states.dtype} of {states.shape}")
     visits = np.bincount(states, weights=base)
     if np.any(visits == 0):
         raise ValueError(f"states: expected each of 0 … {len(visits) - 1}, got no {np.argmin(visits)}")
@@ -225,12 +233,17 @@ def _exponential(
 
 
 def _temperature(kl: Callable[[float], float], kl_bound: float) -> float:
-    """The η at which KL(p‖W) = ε, where the dual of eq. 13 has its minimum; the floor where no η reaches ε."""
+    """The η at which KL(p‖W) = ε, where the dual of eq. 13 has its minimum; the floor where no η reaches ε.
+
+    A bound below the rounding of KL gets an η at which nothing moves.
+    """
     low, high = TEMPERATURE_FLOOR, 1.0
     if kl(low) <= kl_bound:
         return low
-    while kl(high) > kl_bound:  # at most a few dozen times: KL falls as 1/η²
+    while kl(high) > kl_bound:  # KL falls as 1/η²
         high *= 10
+        if high >= TEMPERATURE_CEILING:
+            return high
     # eq. 11, with equality
     logarithm = brentq(lambda value: kl(float(np.exp(value))) - kl_bound, np.log(low), np.log(high), xtol=1e-12)
     return float(np.exp(logarithm))
@@ -262,10 +275,10 @@ def _checked_samples(
     q_values: ArrayLike, states: ArrayLike, base_weights: ArrayLike, kl_bound: float
 ) -> tuple[PerSample, Shaped[np.ndarray, "n ..."], PerSample]:
     q_values, states, base_weights = np.asarray(q_values), np.asarray(states), np.asarray(base_weights)
-    size = len(q_values)
-    if q_values.shape != (size,) or base_weights.shape != (size,) or states.shape[:1] != (size,):
+    size = q_values.size
+    if size == 0 or q_values.shape != (size,) or base_weights.shape != (size,) or states.shape[:1] != (size,):
         raise ValueError(
-            "reps_weights: expected q_values (N,), state_features (N, D) and base_weights (N,), got "
+            "reps_weights: expected q_values (N,), state_features (N, D) and base_weights (N,), N > 0, got "
             f"{q_values.shape}, {states.shape} and {base_weights.shape}"
         )
     checks.positive("kl_bound", kl_bound)

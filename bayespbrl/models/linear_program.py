@@ -33,6 +33,9 @@ def linear_program(differences: ArrayLike) -> LinearProgramResult:
     c is concave, c(x) = min(x, 2x), so the maximum is a linear program: max Σ t_k, t_k ≤ d_k, t_k ≤ 2 d_k. With
     d_k = p_k − n_k, p, n ≥ 0, it is max Σ p_k − 2 n_k under K equations, half as many rows.
 
+    The weight of a feature that is zero in all rows is free; the solver leaves it at its lower bound, −1. So a one-hot
+    state that no trajectory visits is worth least, whereas the posterior mean is 0 there.
+
     Args:
       differences: ψ(preferred) − ψ(dominated), shape (K, D), used as given.
 

@@ -147,21 +147,29 @@ def _numbered(
     who: Shaped[np.ndarray, "..."], names: tuple[str, ...] | None, number: int
 ) -> tuple[Integer[np.ndarray, " k"], tuple[str, ...]]:
     """The number of each of K answerers, who are given by name or by number, and the names by number."""
-    if who.shape == (number,) and number and all(isinstance(each, str) for each in who):
+    if any(isinstance(each, str) for each in who.flat):
+        if who.shape != (number,) or not all(isinstance(each, str) for each in who):
+            raise ValueError(
+                f"answerers: expected {number} names, one for each answer and '' for a person without, got {who}"
+            )
         given = [str(each) for each in who]
         names = tuple(dict.fromkeys(given)) if names is None else names
         if unknown := sorted(set(given) - set(names)):
             raise ValueError(f"answerers: expected names among {', '.join(names)}, got {', '.join(unknown)}")
         who = np.array([names.index(each) for each in given])
-    who = _numbers("answerers", who, number, 0, number if names is None else len(names) - 1)
-    return who, tuple(map(str, range(int(who.max(initial=0)) + 1))) if names is None else names
+    most = np.iinfo(np.int64).max if names is None else len(names) - 1
+    who = _numbers("answerers", who, number, 0, most)
+    if names is None:  # only who answered: a number that is left out is nobody
+        found, who = np.unique(who, return_inverse=True)
+        names = tuple(map(str, found)) or ("0",)
+    return who, names
 
 
 def _numbers(name: str, values: ArrayLike, number: int, least: int, most: int) -> Integer[np.ndarray, " k"]:
     array = np.asarray(values)
     array = array.astype(int) if array.shape == (0,) else array  # an empty list has no type
     if array.shape != (number,) or array.dtype.kind not in "iu" or np.any((array < least) | (array > most)):
-        raise ValueError(f"{name}: expected {number} whole numbers in {least} … {most}, got {values!r}")
+        raise ValueError(f"{name}: expected {number} whole numbers in {least} … {most}, got {checks.one_line(values)}")
     return array
 
 

@@ -19,7 +19,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response, StreamingResponse
+from starlette.responses import PlainTextResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -243,6 +243,9 @@ class Guard:
         token, slash, path = rest.partition("/")
         headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
         known = [seat for own, seat in self.seats.items() if secrets.compare_digest(token.encode(), own.encode())]
+        if known and not slash and scope["method"] == "GET" and self._ours(headers):  # typed without the last slash
+            await RedirectResponse(f"/{token}/")(scope, receive, send)
+            return
         if not (slash and known and self._ours(headers)):
             refusal = PlainTextResponse("expected the address that the program printed, with its token", 403)
             await refusal(scope, receive, send)

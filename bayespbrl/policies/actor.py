@@ -27,6 +27,7 @@ class Actor:
       observe: from an observation of the environment to one of the policy's.
       enact: from an action of the policy's to one of the environment.
       observation_shape: of one observation of the environment; None where it has parts, as those of a `Dict` space.
+      unbatched: from a batch of observations with parts to a list of them; None where it is given one.
     """
 
     policy: Sampler
@@ -35,6 +36,7 @@ class Actor:
     observe: Callable[[Any], Any] = np.asarray
     enact: Callable[[Any], Any] = np.asarray
     observation_shape: tuple[int, ...] | None = ()
+    unbatched: Callable[[Any], list[Any] | None] | None = None
 
     def act(self, observation: Any, *, key: Key[Array, ""] | None = None) -> Any:
         """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete.
@@ -55,7 +57,7 @@ class Actor:
         """Action and `state`, for one observation or a batch of them, as stable-baselines3's policies give.
 
         Args:
-          observation: of the environment, or a batch with a leading axis; only one where observations have parts.
+          observation: of the environment, or a batch with a leading axis, which each part has where there are several.
           state, episode_start: of recurrent policies; passed through and not looked at.
           deterministic: the mean of continuous actions, or the most probable discrete one, instead of a sample.
 
@@ -63,11 +65,17 @@ class Actor:
           ValueError: observations of another shape; a policy of the user's that has neither `mode` nor `probabilities`.
         """
         shape = self.observation_shape
-        if shape is None or (observations := np.asarray(observation)).shape == shape:
+        if shape is None:
+            batch = None if self.unbatched is None else self.unbatched(observation)
+        elif (observed := np.asarray(observation)).shape == shape:
+            batch = None
+        elif observed.shape[1:] == shape:
+            batch = list(observed)
+        else:
+            raise ValueError(f"observation: expected shape {shape}, or a batch of them, got {observed.shape}")
+        if batch is None:
             return self._chosen([observation], deterministic)[0], state
-        if observations.shape[1:] != shape:
-            raise ValueError(f"observation: expected shape {shape}, or a batch of them, got {observations.shape}")
-        return np.array([np.asarray(action) for action in self._chosen(observations, deterministic)]), state
+        return np.array([np.asarray(action) for action in self._chosen(batch, deterministic)]), state
 
     def _chosen(self, observations: Any, deterministic: bool) -> list[Any]:
         """An action for each of several observations."""

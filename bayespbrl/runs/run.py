@@ -11,7 +11,8 @@ import xarray as xr
 
 from bayespbrl import checks, rollouts
 from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, made_again
-from bayespbrl.envs.spaces import check_of_space, from_plain, given_to_plain
+from bayespbrl.envs.spaces import check_of_space, from_plain, given_to_plain, unbatched
+from bayespbrl.envs.stepping import step_limit
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
@@ -111,12 +112,17 @@ def load(
 def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Learner:
     """The learner rebuilt from the log of a run; `own` holds the user's objects, by option name."""
     settings = log.settings
+    options = settings.options()
     for name, given in own.items():
-        if (settings.options()[name] == "other") != (given is not None):
-            expected = f"{name}= again, which the run was started with" if given is None else f"no {name}="
-            raise ValueError(f"{log.path}: expected {expected}, got {given!r}")
-    if settings.environment == "other" and env is None:
-        raise ValueError(f"{log.path}: expected env= again, which the run was started with, got None")
+        if given is not None and options[name] != "other":
+            raise ValueError(f"{log.path}: expected no {name}=, got {given!r}")
+    missing = ["env"] if env is None and settings.environment == "other" else []
+    missing += [name for name, given in own.items() if given is None and options[name] == "other"]
+    if missing:
+        again = ", ".join(f"{name}=" for name in missing)
+        raise ValueError(
+            f"{log.path}: expected {again} again, which the run was started with, got None (only Python can give it)"
+        )
     if settings.environment != "other" and env is not None and identity(env) != identity(settings.env):
         raise ValueError(f"{log.path}: expected no env=, or {settings.env}, which the run was started with, got {env}")
     summarised, policy = log.summarised(), own["policy"]
@@ -126,7 +132,10 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
             env = made_again(settings.env) if settings.environment == "object" else settings.env
         learner = Learner(env, **own, entries=entries, kept=settings)
         log.check_complete(learner.state, summarised)
+        limit = step_limit(learner.environment, settings.rollouts.max_steps)
         for trajectory in learner.trajectories:  # of another environment, where env= is a wrong one
+            if len(trajectory) > limit:
+                raise ValueError(f"env: expected a time limit of {len(trajectory)} steps or more, got {limit}")
             check_of_space("states of the run", trajectory.states, learner.environment.observation_space)
             check_of_space("actions of the run", trajectory.actions, learner.environment.action_space)
     except ValueError as error:
@@ -174,6 +183,7 @@ class Run:
             observe=partial(given_to_plain, given.observation_space, actions=given.action_space),
             enact=partial(from_plain, given.action_space),
             observation_shape=given.observation_space.shape,
+            unbatched=partial(unbatched, given.observation_space),
         )
 
     @property

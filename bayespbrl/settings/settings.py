@@ -273,6 +273,8 @@ OPTIONS: dict[str, str] = {f.name: "" for f in fields(Settings) if f.name not in
 def settings_for(env: str, *, task: Task | None = None, **changes: Any) -> Settings:
     """The preset for an environment with `changes`.
 
+    An environment object of the user's may have another time limit when the run is continued, so its limit is kept.
+
     Args:
       env: short name or gymnasium id.
       task: what the default preset derives options from; None: it derives none.
@@ -281,4 +283,5 @@ def settings_for(env: str, *, task: Task | None = None, **changes: Any) -> Setti
     Raises:
       ValueError: as `Settings.from_options`.
     """
-    return Settings.from_options(env, preset_options(env, changes, task) | changes)
+    limit = {} if task is None or changes.get("environment", "named") == "named" else {"max_steps": task.horizon}
+    return Settings.from_options(env, preset_options(env, changes, task) | changes | limit)

@@ -107,7 +107,7 @@ def infer_utility(
       ties: pairs that were answered with "no difference". There are K pairs and ties in all.
       shown_first: 1 where the first of the pair was shown first, −1 where the second was, 0 where nothing is known,
         shape (K,), for the pairs and then the ties: a side bias is inferred. None: there is none.
-      answerers: who gave each answer, names or numbers from 0 (the names are then "0", "1", …), in the same order:
+      answerers: who gave each answer, by names or whole numbers (the name of 7 is "7"), in the same order:
         each has a lapse rate and, with `shown_first`, a side bias. `posterior["posterior"]["lapse_rate"].sel(
         answerer="Ada")` are the draws of one.
       features: φ, where utilities of single states are wanted too; None: the rows themselves.
@@ -183,7 +183,7 @@ def _by_posterior(
         pairs_satisfied=int(np.sum(margins[comparisons.ordered] > 0)),  # eq. 6
         rhat_max=float(tree.attrs["rhat_max"]),
         effective_sample_size_min=float(tree.attrs["effective_sample_size_min"]),
-        log_evidence=float(tree.attrs["log_evidence"]),
+        log_evidence=float(tree.attrs["log_evidence"] if np.isfinite(tree.attrs["log_evidence_error"]) else np.nan),
     )
     return PosteriorUtility(features, multiples, scales, parts / scales[:, None], comparisons.discount, quality, tree)
 

@@ -14,7 +14,7 @@ class FitQuality:
       pairs, pairs_satisfied: the number of ordered pairs, ties left out, and of those with a positive margin (eq. 6).
       rhat_max, effective_sample_size_min: the worst of the margins and all else that is inferred (NaN where there are
         no draws).
-      log_evidence: log marginal likelihood of the answers (NaN where there is no posterior).
+      log_evidence: log marginal likelihood of the answers (NaN where it cannot be told, or there is no posterior).
     """
 
     converged: bool
