@@ -61,7 +61,12 @@ class NoisyExpert:
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
         answer = parse_answer(self.expert(first, second))
-        return _reversed(answer) if _chance(self.seed, first, second) < self.wrong_answers else answer
+        within = (self._depth,) if self._depth else ()  # each has a stream of its own; a single one is as it ever was
+        return _reversed(answer) if _chance(self.seed, first, second, *within) < self.wrong_answers else answer
+
+    @property
+    def _depth(self) -> int:
+        return self.expert._depth + 1 if isinstance(self.expert, NoisyExpert) else 0
 
 
 @dataclass(frozen=True)
@@ -192,7 +197,7 @@ def named_expert(name: str, *, mean: float = 0.0, scale: float = 1.0, seed: int 
       seed: of its errors.
 
     Raises:
-      ValueError: an unknown name.
+      ValueError: an unknown name, or a scale that is not positive.
     """
     experts: dict[str, Expert] = {
         "return": ReturnExpert(),

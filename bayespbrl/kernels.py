@@ -19,6 +19,7 @@ from bayespbrl import checks
 Vector = Float[Array, " s"] | Float[np.ndarray, " s"]
 Rows = Float[Array, "d s"] | Float[np.ndarray, "d s"]
 SMALLEST_SUM = 1e-200  # of a row of products of exponentials: below it they have lost digits
+ROUNDING = 1e-12  # of a dimension of the states, as a share of its largest value
 FAR = 1e6  # bandwidths from the middle, from where on the expansion of the square may lose more than 1e-4
 ROWS_AT_A_TIME = 1024  # keeps a block of a wide kernel matrix in the processor's cache between its three passes
 
@@ -177,8 +178,8 @@ def median_bandwidths(
     """The median rule: factor × sqrt(median over pairs of the squared difference), per dimension.
 
     The median is over random pairs of rows of `points` (N, S), periodic differences wrapped. Where more than half of
-    the pairs agree the mean takes the median's place; only a constant dimension gets bandwidth zero. The bandwidths are
-    in the units of `points`.
+    the pairs agree the mean takes the median's place; only a dimension that is constant but for rounding gets bandwidth
+    zero. The bandwidths are in the units of `points`.
 
     Raises:
       ValueError: points that are no finite matrix with rows, a factor or a period that is not > 0.
@@ -195,7 +196,8 @@ def median_bandwidths(
     middle, mean = np.median(squares, axis=0), squares.mean(axis=0)
     if (equal := mean == 0).any():  # a rare value may be in no pair
         mean[equal] = _mean_square(points[:, equal], periods[equal])
-    return factor * np.sqrt(np.where(middle > 0, middle, mean))
+    deviations = np.sqrt(np.where(middle > 0, middle, mean))
+    return factor * np.where(deviations > ROUNDING * np.abs(points).max(axis=0), deviations, 0.0)
 
 
 def _wrapped(difference: Float[np.ndarray, "n s"], periods: Float[np.ndarray, " s"]) -> Float[np.ndarray, "n s"]:

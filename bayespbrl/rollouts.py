@@ -304,7 +304,7 @@ def _act(
     policy: Sampler, key: Key[Array, ""], counter: int, observations: Shaped[AnyArray, "n ..."]
 ) -> Shaped[Array, "n ..."]:
     keys = jax.random.split(jax.random.fold_in(key, counter), len(observations))
-    return jax.vmap(policy.sample)(keys, observations)
+    return jax.vmap(lambda *given: jnp.asarray(policy.sample(*given)))(keys, observations)
 
 
 def _act_one_by_one(

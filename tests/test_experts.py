@@ -54,6 +54,13 @@ def test_the_asked_share_of_answers_is_wrong():
         assert abs(wrong - share) <= 4 * np.sqrt(share * (1 - share) / len(pairs))
 
 
+def test_errors_on_errors_are_independent_of_them():
+    pairs = [(trajectory([1.0], 2 * i), trajectory([0.0], 2 * i + 1)) for i in range(4000)]
+    twice = NoisyExpert(NoisyExpert(ReturnExpert(), 0.3), 0.3)
+    wrong = np.mean([twice(*pair) is Answer.SECOND for pair in pairs])
+    assert abs(wrong - 0.42) <= 4 * np.sqrt(0.42 * 0.58 / len(pairs))
+
+
 def test_wrong_answers_are_a_function_of_the_two_trajectories_and_the_seed_alone():
     pairs = [(trajectory([1.0], 2 * i), trajectory([0.0], 2 * i + 1)) for i in range(60)]
 

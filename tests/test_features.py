@@ -204,6 +204,16 @@ def test_median_rule_finds_a_value_so_rare_that_hardly_a_pair_has_it():
     assert not median_bandwidths(np.full((50, 2), 0.1), rng=np.random.default_rng(0)).any()
 
 
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_a_dimension_that_is_constant_but_for_rounding_has_no_bandwidth(scale):
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, 500)
+    points = scale * np.column_stack([angles, np.cos(angles) ** 2 + np.sin(angles) ** 2])
+    assert points[:, 1].std() > 0
+    bandwidths = median_bandwidths(points, rng=np.random.default_rng(0))
+    assert bandwidths[0] > scale
+    assert bandwidths[1] == 0
+
+
 @pytest.mark.parametrize("normalised", [False, True])
 def test_states_beside_a_few_that_are_very_far_keep_their_features(normalised):
     rng = np.random.default_rng(7)

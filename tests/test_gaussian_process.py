@@ -9,6 +9,7 @@ from gymnasium.spaces import Box
 
 from bayespbrl.kernels import coordinates, inverse_bandwidths, radial_basis, squared_exponential
 from bayespbrl.policies import GaussianProcessPolicy, hyperparameter_search, sample_actions
+from bayespbrl.policies.greedy import greedy
 from bayespbrl.policies.hyperparameter_search import FAILED, Hyperparameters, OutputSamples, search
 from bayespbrl.policies.sparse_regression import fit_sparse_regression, inducing_rows, inverse_factor, precisions
 
@@ -108,6 +109,18 @@ def test_repeated_inducing_points_leave_the_posterior_finite_and_the_same():
     twice = sparse_process(np.repeat(points, 2, axis=0), points, targets, weights, points)
     once = sparse_process(points, points, targets, weights, points)
     np.testing.assert_allclose(twice, once, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_clusters_far_apart_in_their_own_width_are_fitted(seed):
+    rng = np.random.default_rng(seed)
+    side = rng.random(1500) < 0.3
+    states, actions = (side + 4e-6 * rng.normal(size=1500))[:, None], np.where(side, 1.0, -1.0)[:, None]
+    space = Box(-np.inf, np.inf, (1,), np.float64)
+    policy = GaussianProcessPolicy.initial(space, Box(-2, 2, (1,), np.float64))
+    fitted = policy.fit(states, actions, np.ones(1500), rng=rng)
+    means = np.array([greedy(fitted).sample(jax.random.key(0), np.array([place])) for place in (0.0, 1.0)])
+    np.testing.assert_allclose(means.ravel(), [-1, 1], atol=0.1)
 
 
 def test_inducing_points_explain_more_than_random_ones():

@@ -73,6 +73,32 @@ def compilations():
     return sum(function._cache_size() for function in (rollouts._simulate, rollouts._evaluate, rollouts._act))
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Listing:
+    """An action of two numbers, as a list."""
+
+    first: float
+
+    def sample(self, key, observation):
+        return [self.first + observation[0], -2.0]
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 3])
+def test_an_action_that_is_a_list_is_a_row(episodes):
+    class Two(gymnasium.Env):
+        observation_space, action_space = Box(-9, 9, (1,), np.float64), Box(-9, 9, (2,), np.float64)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1), {}
+
+        def step(self, action):
+            return np.array([0.5]), 0.0, False, False, {}
+
+    for shown in rollout(Two(), Listing(1.0), key=jax.random.key(0), episodes=episodes, max_steps=2):
+        np.testing.assert_array_equal(shown.actions, [[1.0, -2.0], [1.5, -2.0]])
+
+
 class Plain(gymnasium.Env):
     """Counts its steps, adds up the action, and can be told to go wrong at a step."""
 

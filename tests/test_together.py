@@ -421,6 +421,8 @@ def test_only_those_that_ties_connect_compete_with_a_newcomer():
     standing = Preferences(undominated=(0, 1, 2, 3), ties=((1, 0), (3, 1), (5, 2)))
     assert standing.tied_with(3) == (0, 1, 3)
     assert standing.tied_with(2) == (2,)
+    chain = Preferences(undominated=(0, 1, 2, 3), ties=((2, 3), (1, 2), (0, 1)))
+    assert chain.tied_with(0) == chain.tied_with(3) == (0, 1, 2, 3)
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ def _sample_chunk(
     rows = start + jnp.arange(CHUNK, dtype=jnp.uint32)
     # one key per row, made from the row's number: the padding and the chunk size cannot change what a row draws
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, rows)
-    return jax.vmap(policy.sample)(keys, observations)
+    return jax.vmap(lambda *given: jnp.asarray(policy.sample(*given)))(keys, observations)
 
 
 @jax.jit

@@ -22,7 +22,7 @@ from bayespbrl.checks import indices, matrix, positive, whole
 from bayespbrl.policies.policy import AnyArray
 from bayespbrl.policies.samples import WeightedSamples, location_and_deviation, weighted_samples
 from bayespbrl.policies.spaces import dimension, number_of_values
-from bayespbrl.policies.sparse_regression import inducing_rows, inverse_factor
+from bayespbrl.policies.sparse_regression import inducing_rows, steady_inverse_factor
 
 DECREMENT = 1e-12  # the fit has converged where its quadratic model promises less than half of this, in nats
 NEWTON_STEPS = 50  # at most, O(N A²M²) each; `converged` says whether they sufficed
@@ -164,7 +164,7 @@ class SoftmaxPolicy:
         points = kernels.coordinates(states, period) * kernels.inverse_bandwidths(bandwidths, period)
         rows = inducing_rows(points, visits, self.centres.shape[0], rng=rng)
         # features whose independent weights have the process's prior: K_NM L⁻ᵀ
-        back = inverse_factor(kernels.squared_exponential(points[rows], points[rows])).T
+        back = steady_inverse_factor(kernels.squared_exponential(points[rows], points[rows])).T
         kernel = kernels.squared_exponential(points, points[rows]) @ back
         design = np.column_stack([np.ones(len(states)), (states - location) / scale, kernel])
         weights, newton_decrement, converged = _logistic_regression(design, mass, float(self.prior_scale))

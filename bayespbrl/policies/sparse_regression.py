@@ -60,7 +60,7 @@ def fit_sparse_regression(
       targets, weights: yᵢ and wᵢ ≥ 0; a weight of two counts as two samples where Z is the data.
       signal_variance, noise_variance: s² and σ², > 0, in the square of the target's units.
     """
-    inverse_lower = inverse_factor(inducing_correlations)
+    inverse_lower = steady_inverse_factor(inducing_correlations)
     whitened = inverse_lower @ correlations
     precision = precisions(whitened, weights, signal_variance=signal_variance, noise_variance=noise_variance)
     scaled = whitened * precision
@@ -117,5 +117,22 @@ def inducing_rows(
 
 def inverse_factor(inducing_correlations: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "m m"]:
     """L⁻¹ with LLᵀ = R_M + jitter; the jitter bounds the condition of L by about 1e5."""
-    jittered = inducing_correlations + JITTER * np.eye(len(inducing_correlations))
-    return np.linalg.inv(np.linalg.cholesky(jittered))
+    return _with_jitter(inducing_correlations, JITTER)
+
+
+def steady_inverse_factor(inducing_correlations: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "m m"]:
+    """`inverse_factor` with as much jitter as rounding asks for.
+
+    The squared distance of two points thousands of bandwidths from the others is rounded by more than `JITTER`.
+    """
+    jitter = JITTER
+    while jitter < 1.0:
+        try:
+            return _with_jitter(inducing_correlations, jitter)
+        except np.linalg.LinAlgError:
+            jitter *= 10.0
+    return _with_jitter(inducing_correlations, 1.0)
+
+
+def _with_jitter(correlations: Float[np.ndarray, "m m"], jitter: float) -> Float[np.ndarray, "m m"]:
+    return np.linalg.inv(np.linalg.cholesky(correlations + jitter * np.eye(len(correlations))))
