@@ -197,7 +197,12 @@ def median_bandwidths(
     if (equal := mean == 0).any():  # a rare value may be in no pair
         mean[equal] = _mean_square(points[:, equal], periods[equal])
     deviations = np.sqrt(np.where(middle > 0, middle, mean))
-    return factor * np.where(deviations > ROUNDING * np.abs(points).max(axis=0), deviations, 0.0)
+    return factor * beyond_rounding(deviations, points)
+
+
+def beyond_rounding(deviations: Float[np.ndarray, " s"], points: Rows) -> Float[np.ndarray, " s"]:
+    """Deviations of the dimensions of `points`; zero where a dimension is constant but for rounding."""
+    return np.where(deviations > ROUNDING * np.abs(points).max(axis=0), deviations, 0.0)
 
 
 def _wrapped(difference: Float[np.ndarray, "n s"], periods: Float[np.ndarray, " s"]) -> Float[np.ndarray, "n s"]:

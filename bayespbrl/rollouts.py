@@ -26,6 +26,7 @@ from bayespbrl.envs import functional
 from bayespbrl.envs.functional import FunctionalEnv
 from bayespbrl.envs.opening import AnyEnvironment, environment_name, open_environment, plainly_wrapped
 from bayespbrl.envs.stepping import episodes_by_interface, outside_of, step_limit
+from bayespbrl.policies.batch import sample_rows
 from bayespbrl.policies.policy import AnyArray, Sampler, is_pytree
 from bayespbrl.trajectories import Trajectory
 
@@ -304,7 +305,7 @@ def _act(
     policy: Sampler, key: Key[Array, ""], counter: int, observations: Shaped[AnyArray, "n ..."]
 ) -> Shaped[Array, "n ..."]:
     keys = jax.random.split(jax.random.fold_in(key, counter), len(observations))
-    return jax.vmap(lambda *given: jnp.asarray(policy.sample(*given)))(keys, observations)
+    return sample_rows(policy, keys, observations)
 
 
 def _act_one_by_one(

@@ -3,7 +3,7 @@
 import numpy as np
 from xarray import DataTree
 
-from bayespbrl.diagnostics.predictions import DOMINATED, PREFERRED, answer_probabilities
+from bayespbrl.diagnostics.predictions import PREFERRED, answer_probabilities, if_stated
 from bayespbrl.models import Answers
 from bayespbrl.models.posterior_tree import answers_of
 from bayespbrl.trajectories import Trajectory
@@ -43,6 +43,5 @@ def predicted_answer(
     who = np.array([answerer]) if answerer in names else None
     answers = Answers(shown_first=np.ones(1, int), answerers=who)
     differences = estimate.differences([first, second])
-    chances = answer_probabilities(posterior, differences, answers)[0]
-    stated = float(chances[PREFERRED] + chances[DOMINATED])
-    return float(chances[PREFERRED]) / stated if stated > 0 else 0.5, stated
+    predicted, stated = if_stated(answer_probabilities(posterior, differences, answers), np.array([PREFERRED]))
+    return float(predicted[0]), float(stated[0])

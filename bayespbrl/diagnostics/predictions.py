@@ -20,6 +20,21 @@ PREFERRED, DOMINATED, TIED = 0, 1, 2
 MOST_DRAWS = 2000  # a probability is then known to a hundredth
 
 
+def if_stated(probabilities: np.ndarray, preferred: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of n comparisons, the probability of one order given that either is stated, and that either is.
+
+    Args:
+      probabilities: of `answer_probabilities`, shape (n, 3).
+      preferred: `PREFERRED` or `DOMINATED` for each, shape (n,).
+
+    Returns:
+      both of shape (n,); the first is ½ where the model rules out either order.
+    """
+    stated = probabilities[:, PREFERRED] + probabilities[:, DOMINATED]
+    asked = np.take_along_axis(probabilities, preferred[:, None], axis=1)[:, 0]
+    return np.divide(asked, stated, out=np.full(len(asked), 0.5), where=stated > 0), stated
+
+
 def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: Answers = NOTHING_ELSE) -> np.ndarray:
     """Probability of each possible answer to comparisons that the posterior was not fitted to.
 

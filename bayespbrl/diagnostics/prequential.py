@@ -54,10 +54,8 @@ def prequential_predictions(
         probabilities, _ = predictions.held_out_probabilities(
             differences, model, groups < group, asked, answers=answers, **sampling_options
         )
-        stated = probabilities[:, predictions.PREFERRED] + probabilities[:, predictions.DOMINATED]
         column = np.where(first_preferred[asked], predictions.PREFERRED, predictions.DOMINATED)
-        first = np.take_along_axis(probabilities, column[:, None], axis=1)[:, 0]
-        predicted[asked] = np.divide(first, stated, out=np.full(len(first), 0.5), where=stated > 0)
+        predicted[asked], _ = predictions.if_stated(probabilities, column)
     return predicted
 
 

@@ -14,6 +14,13 @@ from bayespbrl.policies.policy import AnyArray, Policy, Sampler
 CHUNK = 1024
 
 
+def sample_rows(
+    policy: Sampler, keys: Key[Array, " n"], observations: Shaped[AnyArray, "n ..."]
+) -> Shaped[Array, "n ..."]:
+    """One action for each key and observation, traceable; an action may be a list of numbers."""
+    return jax.vmap(lambda key, observation: jnp.asarray(policy.sample(key, observation)))(keys, observations)
+
+
 @jax.jit
 def _sample_chunk(
     policy: Sampler, key: Key[Array, ""], start: Shaped[AnyArray, ""], observations: Shaped[AnyArray, "n ..."]
@@ -21,7 +28,7 @@ def _sample_chunk(
     rows = start + jnp.arange(CHUNK, dtype=jnp.uint32)
     # one key per row, made from the row's number: the padding and the chunk size cannot change what a row draws
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, rows)
-    return jax.vmap(lambda *given: jnp.asarray(policy.sample(*given)))(keys, observations)
+    return sample_rows(policy, keys, observations)
 
 
 @jax.jit

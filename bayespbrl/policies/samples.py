@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from numpy.typing import ArrayLike
 
+from bayespbrl.kernels import beyond_rounding
+
 
 @dataclass(frozen=True)
 class WeightedSamples:
@@ -56,7 +58,7 @@ def location_and_deviation(
     """Weighted mean and standard deviation of each dimension; zero where it is constant but for rounding."""
     location = shares @ observations
     deviation = np.sqrt(shares @ np.square(observations - location))
-    return location, np.where(deviation > 1e-12 * np.abs(observations).max(axis=0), deviation, 0.0)
+    return location, beyond_rounding(deviation, observations)
 
 
 def _checked_weights(name: str, weights: ArrayLike, number: int) -> Float[np.ndarray, " n"]:

@@ -115,9 +115,10 @@ def inducing_rows(
     return chosen[pivots]
 
 
-def inverse_factor(inducing_correlations: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "m m"]:
-    """L⁻¹ with LLᵀ = R_M + jitter; the jitter bounds the condition of L by about 1e5."""
-    return _with_jitter(inducing_correlations, JITTER)
+def inverse_factor(inducing_correlations: Float[np.ndarray, "m m"], jitter: float = JITTER) -> Float[np.ndarray, "m m"]:
+    """L⁻¹ with LLᵀ = R_M + jitter; the usual jitter bounds the condition of L by about 1e5."""
+    jittered = inducing_correlations + jitter * np.eye(len(inducing_correlations))
+    return np.linalg.inv(np.linalg.cholesky(jittered))
 
 
 def steady_inverse_factor(inducing_correlations: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "m m"]:
@@ -128,11 +129,7 @@ def steady_inverse_factor(inducing_correlations: Float[np.ndarray, "m m"]) -> Fl
     jitter = JITTER
     while jitter < 1.0:
         try:
-            return _with_jitter(inducing_correlations, jitter)
+            return inverse_factor(inducing_correlations, jitter)
         except np.linalg.LinAlgError:
             jitter *= 10.0
-    return _with_jitter(inducing_correlations, 1.0)
-
-
-def _with_jitter(correlations: Float[np.ndarray, "m m"], jitter: float) -> Float[np.ndarray, "m m"]:
-    return np.linalg.inv(np.linalg.cholesky(correlations + jitter * np.eye(len(correlations))))
+    return inverse_factor(inducing_correlations, 1.0)
