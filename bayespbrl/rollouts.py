@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 from jax import Array
 from jaxtyping import Bool, Float, Int, Key, Shaped
 
@@ -25,7 +25,7 @@ from bayespbrl.checks import whole
 from bayespbrl.envs import functional
 from bayespbrl.envs.functional import FunctionalEnv
 from bayespbrl.envs.opening import AnyEnvironment, environment_name, open_environment, plainly_wrapped
-from bayespbrl.envs.stepping import episodes_by_interface, outside_of, step_limit
+from bayespbrl.envs.stepping import check_observed, episodes_by_interface, outside_of, step_limit
 from bayespbrl.policies.batch import sample_rows
 from bayespbrl.policies.policy import AnyArray, Sampler, is_pytree
 from bayespbrl.trajectories import Trajectory
@@ -92,14 +92,7 @@ def rollout(
         reset_keys = keys if starts is None else jax.vmap(jax.random.key)(np.asarray(starts))
         run = _simulate(dynamics, policy, keys, reset_keys, hold, steps=steps)
         observations, actions, rewards, terminated, lengths = (np.asarray(part) for part in run)
-    _check_actions(dynamics, policy, actions, lengths)
-    if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
-        raise ValueError(_not_finite(env, _first_not_finite(observations, rewards)))
-    if (outside := outside_of(dynamics.observation_space, observations)).any():
-        raise ValueError(
-            f"environment {environment_name(env)}: expected observations of {dynamics.observation_space}, got "
-            f"{observations[outside][0]} at {_where(int(np.argmax(outside.any(axis=0))))}"
-        )
+    _check_run(env, dynamics, policy, observations, actions, rewards, lengths)
     return tuple(
         Trajectory(states[: length + 1], acts[:length], signal[:length], bool(ended))
         for states, acts, signal, ended, length in zip(observations, actions, rewards, terminated, lengths, strict=True)
@@ -123,9 +116,9 @@ def returns(
         return Returns(*(np.array(column) for column in zip(*rows, strict=True)))
     with jax.enable_x64(True):
         evaluated = _evaluate(dynamics, policy, key, limit, episodes=episodes)
-        total, steps, terminated, finite = map(np.asarray, evaluated)
-    if not finite.all():
-        raise ValueError(_not_finite(env, int(steps[~finite].min())))
+        total, steps, terminated, sound = map(np.asarray, evaluated)
+    if not sound.all():  # the same episodes so far, whose check says what is wrong
+        rollout(env, policy, key=key, episodes=episodes, max_steps=max(int(steps[~sound].min()), 1))
     return Returns(total, steps, terminated)
 
 
@@ -156,11 +149,29 @@ def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
     return inner.dynamics
 
 
-def _check_actions(
-    dynamics: FuncEnv, policy: Sampler, actions: Shaped[np.ndarray, "n t ..."], lengths: Int[np.ndarray, " n"]
+def _check_run(
+    env: gymnasium.Env,
+    dynamics: FuncEnv,
+    policy: Sampler,
+    observations: Shaped[np.ndarray, "n t1 ..."],
+    actions: Shaped[np.ndarray, "n t ..."],
+    rewards: Float[np.ndarray, "n t"],
+    lengths: Int[np.ndarray, " n"],
 ) -> None:
-    """Check the actions that were taken; JAX would take the nearest of a discrete space."""
-    _check_of_space(policy, dynamics.action_space, actions[np.arange(actions.shape[1]) < lengths[:, None]])
+    """Check a run of pure functions, and name what went wrong first: of NaN the policy can only make more NaN.
+
+    An action outside a discrete space would be taken as the nearest by JAX.
+    """
+    flat = observations.reshape(-1, *observations.shape[2:])
+    bad = ~np.isfinite(flat).reshape(len(flat), -1).all(axis=1) | outside_of(dynamics.observation_space, flat)
+    bad = bad.reshape(observations.shape[:2])
+    bad[:, 1:] |= ~np.isfinite(rewards)
+    first = int(np.argmax([*bad.any(axis=0), True]))  # the environment's step; 0 is the reset
+    taken = actions[:, :first]
+    _check_of_space(policy, dynamics.action_space, taken[np.arange(taken.shape[1]) < lengths[:, None]])
+    if first < bad.shape[1]:
+        where = f"step {first}" if first else "its reset"
+        check_observed(env, where, observations[:, first], rewards[:, first - 1 : first])
 
 
 def _check_of_space(policy: Sampler, space: gymnasium.Space[Any], actions: Shaped[np.ndarray, "n ..."]) -> None:
@@ -171,24 +182,6 @@ def _check_of_space(policy: Sampler, space: gymnasium.Space[Any], actions: Shape
     outside = outside_of(space, actions) if fits else np.ones(len(actions), bool)
     if outside.any():
         raise ValueError(f"policy {type(policy).__name__}: expected actions of {space}, got {actions[outside][0]}")
-
-
-def _first_not_finite(observations: Shaped[np.ndarray, "n t1 ..."], rewards: Float[np.ndarray, "n t"]) -> int:
-    """The earliest bad step over all episodes; 0 is the reset."""
-    bad = ~np.isfinite(observations).reshape(*observations.shape[:2], -1).all(axis=2)
-    bad[:, 1:] |= ~np.isfinite(rewards)
-    return int(np.argmax(bad.any(axis=0)))
-
-
-def _not_finite(env: gymnasium.Env, step: int) -> str:
-    return (
-        f"environment {environment_name(env)}: expected finite observations and rewards, got NaN or infinity at "
-        f"{_where(step)}"
-    )
-
-
-def _where(step: int) -> str:
-    return f"step {step}" if step else "its reset"
 
 
 def _start(dynamics: FuncEnv, key: Key[Array, ""]) -> tuple[Running, Key[Array, ""]]:
@@ -268,25 +261,31 @@ def _simulate(
 def _evaluate(
     dynamics: FuncEnv, policy: Sampler, key: Key[Array, ""], steps: int, *, episodes: int
 ) -> tuple[Array, ...]:
-    """Sums instead of trajectories, in a loop that stops once every episode has ended; new `steps` compile nothing."""
+    """Sums, and whether `_check_run` would find nothing, until every episode has ended; new `steps` compile nothing."""
     running, steps_keys = jax.vmap(partial(_start, dynamics))(jax.random.split(key, episodes))
     advance = jax.vmap(partial(_advance, dynamics, policy), in_axes=(0, 0, None))
 
     def loop_step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        t, (state, observation, alive), total, length, terminated, finite = carry
-        (state, observation, still), (_, reward, ended, _) = advance((state, observation, alive), steps_keys, t)
-        finite &= jnp.isfinite(reward) & jnp.isfinite(observation.reshape(episodes, -1)).all(axis=1)
+        t, (state, observation, alive), total, length, terminated, sound = carry
+        (state, observation, still), (action, reward, ended, _) = advance((state, observation, alive), steps_keys, t)
+        sound &= jnp.isfinite(reward) & _within(dynamics.observation_space, observation)
+        sound &= _within(dynamics.action_space, action) | ~alive
         length = length + alive
-        return t + 1, (state, observation, still & finite), total + reward, length, terminated | ended, finite
+        return t + 1, (state, observation, still & sound), total + reward, length, terminated | ended, sound
 
     def goes_on(carry: tuple[Any, ...]) -> Bool[Array, ""]:
         return (carry[0] < steps) & carry[1][2].any()
 
-    none = jnp.zeros(episodes, bool)
-    start_finite = jnp.isfinite(running[1].reshape(episodes, -1)).all(axis=1)
-    running = (running[0], running[1], running[2] & start_finite)
-    carry = (jnp.asarray(0), running, jnp.zeros(episodes), jnp.zeros(episodes, int), none, start_finite)
+    sound, none = _within(dynamics.observation_space, running[1]), jnp.zeros(episodes)
+    running = (*running[:2], running[2] & sound)
+    carry = (jnp.asarray(0), running, none, none.astype(int), none.astype(bool), sound)
     return jax.lax.while_loop(goes_on, loop_step, carry)[2:]
+
+
+def _within(space: gymnasium.Space[Any], values: Shaped[Array, "n ..."]) -> Bool[Array, " n"]:
+    """Which rows are of a `Discrete` space that counts from 0, or finite; the bounds of a `Box` are not looked at."""
+    within = (values >= 0) & (values < space.n) if isinstance(space, Discrete) else jnp.isfinite(values)
+    return within.reshape(len(values), -1).all(axis=1)
 
 
 def _wide(dynamics: FuncEnv, observation: Shaped[AnyArray, "..."]) -> Shaped[Array, "..."]:

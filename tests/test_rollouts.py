@@ -602,20 +602,78 @@ class Rooms(gymnasium.Env):
         (Corridor({"bad": ""}), r"Corridor: expected observations of Discrete\(5\), got 5 at step 5"),
     ],
 )
-def test_a_discrete_observation_outside_its_space_is_named_with_the_step(env, message):
+@pytest.mark.parametrize("run", [rollout, returns])
+def test_a_discrete_observation_outside_its_space_is_named_with_the_step(run, env, message):
     with pytest.raises(ValueError, match=message):
-        rollout(env, Coin(np.array(0.5)), key=KEY, episodes=1, max_steps=9)
+        run(env, Coin(np.array(0.5)), key=KEY, episodes=1, max_steps=9)
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Times:
+    factor: np.ndarray
+
+    def sample(self, key, observation):
+        return self.factor * observation
+
+
+class Pushed(Drifting):
+    """Adds the action to its state; its fourth observation is NaN if so wished."""
+
+    action_space = Box(-np.inf, np.inf, (1,), dtype=np.float32)
+
+    def transition(self, state, action, rng, params=None):
+        return state + 1 + action.astype(state.dtype)
+
+
+@pytest.mark.parametrize("run", [rollout, returns])
 @pytest.mark.parametrize("env", [Plain(), "swing-up"], ids=["by interface", "compiled"])
-def test_a_policy_that_returns_nan_is_named(env):
+def test_a_policy_that_returns_nan_is_named(run, env):
     with pytest.raises(ValueError, match="policy Gaussian: expected finite actions"):
-        rollout(env, Gaussian(np.array([np.nan]), np.ones(1)), key=KEY, episodes=1, max_steps=9)
+        run(env, Gaussian(np.array([np.nan]), np.ones(1)), key=KEY, episodes=1, max_steps=9)
 
 
-def test_an_action_outside_the_space_is_named():
+@pytest.mark.parametrize("run", [rollout, returns])
+def test_of_a_policy_and_an_environment_the_first_that_returns_nan_is_named(run):
+    arguments = {"key": KEY, "episodes": 2, "max_steps": 9}
+    with pytest.raises(ValueError, match=r"environment Pushed: expected finite .* at step 3"):
+        run(Pushed({"bad": "observation"}), Times(np.zeros(1)), **arguments)
+    with pytest.raises(ValueError, match="policy Times: expected finite actions"):
+        run(Pushed({"bad": "observation"}), Times(np.array([np.nan])), **arguments)
+
+
+@pytest.mark.parametrize("run", [rollout, returns])
+@pytest.mark.parametrize("bad", ["", "observation"])
+def test_an_action_outside_the_space_is_named(run, bad):
     with pytest.raises(ValueError, match=r"policy Constant: expected actions of Discrete\(2\), got 2"):
-        rollout(Drifting({"bad": ""}), Constant(np.array(2)), key=KEY, episodes=3, max_steps=9)
+        run(Drifting({"bad": bad}), Constant(np.array(2)), key=KEY, episodes=3, max_steps=9)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class AtTheEnd:
+    end: np.ndarray
+
+    def sample(self, key, observation):
+        return jnp.where(observation[0] >= self.end, 2, 1)
+
+
+class Uneven(Drifting):
+    """Begins anywhere below 3, so that some episodes end before others."""
+
+    def initial(self, rng, params=None):
+        return jax.random.randint(rng, (1,), 0, 3).astype(jnp.float32)
+
+
+def test_what_a_policy_would_do_after_the_end_is_not_looked_at():
+    env, arguments = Uneven({"bad": ""}), {"key": KEY, "episodes": 8, "max_steps": 9}
+    evaluated = returns(env, AtTheEnd(np.array(6)), **arguments)
+    assert len(set(evaluated.steps)) > 1
+    run = rollout(env, AtTheEnd(np.array(6)), **arguments)
+    assert [trajectory.total_reward for trajectory in run] == list(evaluated.total)
+    for function in (rollout, returns):
+        with pytest.raises(ValueError, match="policy AtTheEnd"):
+            function(env, AtTheEnd(np.array(5)), **arguments)
 
 
 @pytest.mark.parametrize(

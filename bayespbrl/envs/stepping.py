@@ -187,14 +187,14 @@ def _batch(
     with _blaming(name, "its reset"):
         observations, _ = vector.reset(seed=seed)  # type: ignore[arg-type]  # copies take a list too
     alive, ended, lengths = np.ones(lanes, bool), np.zeros(lanes, bool), np.zeros(lanes, int)
-    states, actions, rewards = [_checked(env, "its reset", _wide(seen, observations))], [], []
+    states, actions, rewards = [check_observed(env, "its reset", _wide(seen, observations))], [], []
     t = 0
     while t < steps and alive.any():
         actions.append(_within(done, act(first, t, states[-1])))
         t += 1
         with _blaming(name, f"step {t}"):
             observations, reward, terminated, truncated, _ = vector.step(actions[-1].copy())  # which it may change
-        _checked(env, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
+        check_observed(env, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
         # what idle lanes return must not reach the policy as NaN
         states.append(np.nan_to_num(_wide(seen, observations)))
         rewards.append(np.asarray(reward, float))
@@ -218,7 +218,8 @@ def _within(space: gymnasium.Space[Any], actions: Rows) -> Rows:
     return np.asarray(actions).astype(np.int64)
 
 
-def _checked(env: gymnasium.Env, where: str, observations: Rows, *rewards: Rows) -> Rows:
+def check_observed(env: gymnasium.Env, where: str, observations: Rows, *rewards: Rows) -> Rows:
+    """Rows of observations, with rewards, as they are; `ValueError` for one that is not finite or of the space."""
     if not all(np.isfinite(values).all() for values in (observations, *rewards)):
         raise ValueError(
             f"environment {environment_name(env)}: expected finite observations and rewards, got NaN or infinity at "
