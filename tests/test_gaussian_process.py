@@ -276,6 +276,22 @@ def test_the_search_keeps_a_good_start_that_one_bold_generation_cannot_beat(aske
     np.testing.assert_allclose(bold.hyperparameters.logarithms, good.logarithms)
 
 
+def test_the_search_begins_with_half_of_the_weighted_mean_square():
+    points = some_samples(40, np.random.default_rng(16))[0]
+    targets, weights = np.tile([2.0, 20.0], 20), np.tile([3.0, 1.0], 20)  # (3·4 + 400)/4 = 103
+    begun = search(
+        OutputSamples(points, targets, weights, PERIOD),
+        start=None,
+        rule=BANDWIDTHS,
+        minimum_noise_variance=1.0,
+        step_size=0.5,
+        evaluations=1,
+        rng=np.random.default_rng(0),
+    ).hyperparameters
+    assert (begun.signal_variance, begun.noise_variance) == pytest.approx((51.5, 51.5))
+    np.testing.assert_allclose(begun.bandwidths, BANDWIDTHS)
+
+
 def test_held_out_objective_is_the_full_process_on_the_other_half():
     points, targets, weights = some_samples(30, np.random.default_rng(15))
     result = found(1, samples=(points, targets, weights), rule=BANDWIDTHS)

@@ -22,6 +22,7 @@ from bayespbrl.policies import (
     sample_actions,
     softmax,
 )
+from bayespbrl.policies.samples import location_and_deviation
 from bayespbrl.policies.spaces import centre_and_range
 
 CONTINUOUS = Box(-np.inf, np.inf, (2,))
@@ -343,6 +344,25 @@ def test_a_linear_fit_to_few_samples_holds_the_noise_and_stays_near_the_old_mean
     assert np.mean(few.kl_divergence(many, states[:40])) < 0.3  # interpolated it would be 0.5
     towards = many.fit(states[:40], many._means(states[:40]), np.ones(40))
     np.testing.assert_allclose(towards._means(states), many._means(states), atol=1e-9)
+
+
+@pytest.mark.parametrize(("number", "held"), [(5, True), (7, False)])
+def test_a_linear_fit_has_the_noise_of_twice_as_many_samples_as_an_action_has_coefficients(number, held):
+    rng = np.random.default_rng(1)
+    policy = LinearGaussianPolicy.initial(Box(-1, 1, (2,), np.float64), TORQUE)
+    states, actions = rng.normal(size=(number, 2)), rng.normal(size=(number, 1))
+    fitted = policy.fit(states, actions, np.ones(number))
+    assert np.array_equal(fitted.factor, policy.factor) is held
+
+
+def test_a_dimension_that_is_constant_but_for_rounding_has_no_deviation():
+    rng = np.random.default_rng(2)
+    observations = np.column_stack([np.full(300, 1e6 + 0.1), 1e6 + 0.1 * rng.normal(size=300)])
+    weights = rng.random(300)
+    location, deviation = location_and_deviation(observations, weights / weights.sum())
+    assert location[0] == pytest.approx(1e6 + 0.1)
+    assert deviation[0] == 0
+    assert deviation[1] == pytest.approx(0.1, rel=0.2)
 
 
 def test_no_observation_is_refused():

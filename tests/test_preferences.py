@@ -52,6 +52,7 @@ def test_a_beaten_opponent_gives_way_to_who_stands_for_its_start():
     assert [opponent_now(new, opponents, known, Preferences()) for new in (1, 2, 4)] == [0, 0, 3]
     assert opponent_now(2, opponents, known, beaten) == 1
     assert opponent_now(2, {}, known, beaten) == 3
+    assert opponent_now(1, opponents, known, beaten) == 0  # nobody is compared with itself
 
 
 def test_the_side_is_known_of_what_was_asked_and_of_nothing_that_follows():

@@ -169,6 +169,28 @@ def test_the_default_derives_from_spaces_and_horizon_what_tasks_differ_in():
     assert settings_for("SomebodysEnv-v3", task=TASK, discount=0.9).critic.discount == 0.9
 
 
+def measured(spreads, steps=100, actions=None):
+    """A task of 100 steps, whose states have the given deviations where actions are repeated for so many steps."""
+
+    def episodes(limit, hold):
+        signs = np.where(np.arange(min(steps, limit) + 1) % 2, 1.0, -1.0)
+        return [signs[:, None] * np.array(spreads.get(hold, (0.0, 0.0)))]
+
+    return Task(Box(-1.0, 1.0, (2,)), actions or Discrete(2), horizon=100, random_episodes=episodes)
+
+
+def test_random_actions_are_repeated_for_as_many_steps_as_spread_all_dimensions_most():
+    spreads = {1: (1000.0, 0.1), 2: (900.0, 1.0), 4: (100.0, 0.9)}  # shares of 0.55, 0.95 and 0.5
+    assert measured(spreads).longer_hold() == {"exploration_hold": 2}
+    assert measured(spreads, steps=91).longer_hold() == {"exploration_hold": 2}
+    assert measured(spreads, steps=89).longer_hold() == {}  # random actions end episodes
+    assert measured(spreads, actions=Box(-1.0, 1.0, (1,))).longer_hold() == {}
+    # an episode has ten different actions at least
+    assert measured(spreads | {8: (2000.0, 2.0)}).longer_hold() == {"exploration_hold": 8}
+    assert measured(spreads | {16: (2000.0, 2.0)}).longer_hold() == {"exploration_hold": 2}
+    assert measured({}).longer_hold() == {"exploration_hold": 1}
+
+
 @pytest.mark.parametrize(
     ("steps", "task", "options", "number"),
     [
