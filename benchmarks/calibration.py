@@ -32,9 +32,9 @@ def run_directories(study: Path) -> list[Path]:
     """The run directory itself, or those in it."""
     if (study / "settings.json").exists():
         return [study]
-    runs = sorted(path.parent for path in study.glob("*/settings.json"))
+    runs = sorted(path.parent for path in study.glob("*/summary.json"))
     if not runs:
-        raise ValueError(f"{study}: expected a run directory or a folder of them, got none")
+        raise ValueError(f"{study}: expected a run directory or a folder of them with a finished iteration, got none")
     return runs
 
 
@@ -69,9 +69,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studies", nargs="+", help="a run directory, or a folder of them")
     studies = parser.parse_args().studies
-    print(markdown(pd.DataFrame([row(Path(study)) for study in studies])), flush=True)
-    for statistic in ("agreement", "signal"):
-        print_gains(studies, statistic)
+    try:
+        print(markdown(pd.DataFrame([row(Path(study)) for study in studies])), flush=True)
+        for statistic in ("agreement", "signal"):
+            print_gains(studies, statistic)
+    except ValueError as error:
+        parser.exit(2, f"{parser.prog}: {error}\n")
 
 
 if __name__ == "__main__":

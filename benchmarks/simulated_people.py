@@ -42,6 +42,7 @@ QUANTITIES = ("lapse rate 0", "lapse rate 1", "side bias 0", "side bias 1")
 ENDS = ("true", "mean", "lower", "upper")
 COLUMNS = [
     "seed",
+    "drawn",
     *(f"{name} {end}" for name in QUANTITIES for end in ENDS),
     *("ties", "log score", "log score without", "stated", "converged", "converged without"),
 ]
@@ -175,4 +176,4 @@ if __name__ == "__main__":
     chosen = parser.parse_args()
     out = chosen.out or RESULTS / f"simulated-people{'-drawn' if chosen.drawn else ''}.csv"
     seeds = range(chosen.seed, chosen.seed + chosen.runs)
-    show(run(seeds, out, COLUMNS, partial(one_run, drawn=chosen.drawn)))
+    show(run(seeds, out, COLUMNS, partial(one_run, drawn=chosen.drawn), {"drawn": float(chosen.drawn)}))

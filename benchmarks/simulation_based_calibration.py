@@ -16,21 +16,21 @@ Printed are, for each functional, the p-value of uniformity (χ², ten bins) and
 `--bug` plants one that must be rejected: `no-setting` (the setting is never moved), `no-volume` (its move forgets the
 volume), `no-lapses` (the lapse rate is taken for zero), `one-steepness` (steepness is given, wrongly), `narrow` (the
 weights outside the answers' span are half as wide), `prior-scale` (the prior's scale is taken for twice what it is),
-`half` (only the first half of the answers is used), `unmoved` (the chains stay where they start).
+`half` (only the first half of the answers is used), `unmoved` (the chains stay where they start). In the file they are
+numbered from 1 in this order; 0 is none.
 """
 
 import argparse
-import csv
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from functools import cache, partial
-from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from rows_by_seed import Row, run
 from scipy import stats
 
 from bayespbrl.models import Answers, EllipticalSlice, PreferenceModel, chains, gibbs, low_rank, posterior_draws
@@ -48,11 +48,14 @@ WRONG_MODELS = {
     "prior-scale": PreferenceModel(2.0, steepness=None, lapse_rate=None),
 }
 BUGS = ("no-setting", "no-volume", "no-lapses", "one-steepness", "narrow", "prior-scale", "half", "unmoved")
-Ranks = dict[str, float]
+QUANTITIES = (
+    *("margin", "probability", "return of the first", "lapse rate", "steepness", "setting", "tie threshold"),
+    "log likelihood",
+)
 
 
-def one_run(seed: int, bug: str = "", *, ties: bool = False) -> Ranks:
-    """The rank of each true value, in [0, 1]."""
+def one_run(seed: int, bug: str = "", *, ties: bool = False) -> Row:
+    """The rank of each true value, in [0, 1], with the seed."""
     _plant(bug)
     rng = np.random.default_rng([seed, 19])
     features = _features(rng)
@@ -79,7 +82,7 @@ def one_run(seed: int, bug: str = "", *, ties: bool = False) -> Ranks:
     compared = _compared(features, drawn, truth)
     compared["log likelihood"] = _log_likelihood(features, pairs, tied, drawn, truth)
     chosen = rng.choice(drawn["setting"].size, KEPT, replace=False)
-    return {name: _rank(rng, sample[chosen], true) for name, (sample, true) in compared.items()}
+    return {"seed": seed} | {name: _rank(rng, sample[chosen], true) for name, (sample, true) in compared.items()}
 
 
 def _posterior(
@@ -228,23 +231,6 @@ def _plant(bug: str) -> None:
         setattr(EllipticalSlice, "sample", lambda self, state, *_: state)  # noqa: B010
 
 
-def _all_ranks(seeds: Sequence[int], jobs: int, bug: str, ties: bool) -> Iterator[tuple[int, Ranks]]:
-    if jobs == 1:
-        yield from ((seed, one_run(seed, bug, ties=ties)) for seed in seeds)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as executor:
-        yield from zip(seeds, executor.map(partial(one_run, bug=bug, ties=ties), seeds), strict=True)
-
-
-def kept_ranks(path: Path | None) -> dict[int, Ranks]:
-    """The rows of a file of ranks, by seed; none where there is no file."""
-    if path is None or not path.exists():
-        return {}
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {int(row.pop("seed")): {name: float(rank) for name, rank in row.items()} for row in rows}
-
-
 def main() -> None:
     """Run what is missing, then print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
@@ -254,22 +240,17 @@ def main() -> None:
     parser.add_argument("--bug", choices=BUGS, default="")
     parser.add_argument("--ties", action="store_true")
     parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    seeds = range(arguments.seed, arguments.seed + arguments.runs)
-    known = {seed: ranks for seed, ranks in kept_ranks(arguments.out).items() if seed in seeds}
-    missing = [seed for seed in seeds if seed not in known]
-    for seed, ranks in _all_ranks(missing, arguments.jobs, arguments.bug, arguments.ties):
-        known[seed] = ranks
-        if arguments.out:
-            with arguments.out.open("a", newline="") as file:
-                writer = csv.writer(file)
-                if not file.tell():
-                    writer.writerow(["seed", *ranks])
-                writer.writerow([seed, *(f"{rank:.5f}" for rank in ranks.values())])
-    report([known[seed] for seed in seeds])
+    chosen = parser.parse_args()
+    quantities = [name for name in QUANTITIES if chosen.ties or name != "tie threshold"]
+    same = {"ties": float(chosen.ties), "bug": float(1 + BUGS.index(chosen.bug) if chosen.bug else 0)}
+    seeds, one = range(chosen.seed, chosen.seed + chosen.runs), partial(one_run, bug=chosen.bug, ties=chosen.ties)
+    with TemporaryDirectory() as folder:
+        file = chosen.out or Path(folder) / "ranks.csv"
+        rows = run(seeds, file, ["seed", *same, *quantities], one, same, chosen.jobs)
+    report([{name: row[name] for name in quantities} for row in rows])
 
 
-def report(rows: Sequence[Ranks]) -> None:
+def report(rows: Sequence[Row]) -> None:
     """Print uniformity of each functional."""
     found = {name: [ranks[name] for ranks in rows] for name in rows[0]}
     p_values = {}

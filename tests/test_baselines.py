@@ -9,7 +9,9 @@ import pytest
 from test_trials import without_processes
 from toys import Push
 
+import bayespbrl
 from bayespbrl.baselines import epmc, every_visit_preferences, pf, programming_by_feedback
+from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.envs.gridworld import DYNAMICS, REWARDS, START
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.experts import MarginExpert, ReturnExpert
@@ -198,6 +200,14 @@ baseline = "pf"
 """
 
 
+@pytest.mark.parametrize(("baseline", "task"), [("pf", "swing-up"), ("epmc", "gridworld")])
+def test_a_baseline_on_a_task_that_is_not_its_own_is_refused_before_anything_runs(tmp_path, baseline, task):
+    text = DECLARATION.replace('"pf"', f'"{baseline}"').replace("tasks.gridworld", f"tasks.{task}")
+    with pytest.raises(ValueError, match=f"study tiny, {task}/pf: baseline {baseline}: expected"):
+        Study.prepare(parsed(text, "tiny"), tmp_path / "tiny")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_a_baseline_is_a_cell_of_a_study_with_a_line_for_each_answer(tmp_path, monkeypatch):
     monkeypatch.setattr(pf, "DRAWS", 20)
@@ -208,6 +218,9 @@ def test_a_baseline_is_a_cell_of_a_study_with_a_line_for_each_answer(tmp_path, m
     assert [line.split(",")[6] for line in lines[1:]] == ["1", "2", "3"]  # two answers first, then one an iteration
     again = Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "tiny")
     assert again.finished == 1
+    for read in (write_report, bayespbrl.load, bayespbrl.resume):
+        with pytest.raises(ValueError, match=r"expected a run of the learner, got a trial of a baseline: see its base"):
+            read(tmp_path / "tiny/gridworld/pf/seed-2985")
     file = tmp_path / "tiny/gridworld/pf/seed-2985/baseline.json"
     file.write_text(json.dumps({"iterations": []}))
     with pytest.raises(ValueError, match="expected the values of a baseline"):

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import re
+import shutil
 import subprocess
 import sys
 from functools import partial
@@ -222,6 +223,17 @@ def test_rows_by_seed_go_on_where_they_were_cut(tmp_path):
     assert rows_by_seed.run([6], file, columns, square) == rows[1:]
     with pytest.raises(SystemExit, match="expected rows with square 36, got 25; choose another --out"):
         rows_by_seed.run([6], file, columns, square, {"square": 36})
+    with pytest.raises(SystemExit, match="expected a column cube, got none; choose another --out"):
+        rows_by_seed.run([6], file, [*columns, "cube"], square)
+
+
+def test_ranks_of_another_model_are_not_taken_for_those_of_this_one(tmp_path):
+    study, kept = benchmark("simulation_based_calibration"), "results/simulation-based-calibration.csv"
+    file = Path(shutil.copy(Path(__file__).parents[1] / "benchmarks" / kept, tmp_path))
+    ranks = study.run(range(5600, 5603), file, ["seed", "ties", "bug", "margin"], None, {"ties": 1.0, "bug": 0.0})
+    assert [row["seed"] for row in ranks] == [5600, 5601, 5602]
+    with pytest.raises(SystemExit, match="expected rows with bug 8, got 0"):
+        study.run(range(5600, 5603), file, ["seed", "ties", "bug", "margin"], None, {"ties": 1.0, "bug": 8.0})
 
 
 @pytest.mark.slow

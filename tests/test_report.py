@@ -155,7 +155,7 @@ def test_the_sections_come_in_the_order_of_the_questions_a_reader_asks(page):
         "Answers, most surprising first",
         "Calibration of the predictions",
         "Policy updates",
-        "Sensitivity to σ and m",
+        "Sensitivity to prior and likelihood",
         "All iterations",
     ]
     assert "could not be made" not in page.text
@@ -406,6 +406,12 @@ def test_states_of_any_dimension_are_shown(tmp_path, observations, kind, size):
     assert table.sizes["state"] == size
     if kind == "cloud":
         assert table.attrs["dimensions"] == (1, 3)  # the others hardly leave their place
+
+
+def test_a_dimension_that_is_constant_has_a_map_with_a_height():
+    states = np.array([[-1.0, 0.5], [3.0, 0.5]])
+    grid, _ = report_tables._states_to_show(None, states, np.random.default_rng(0))
+    np.testing.assert_allclose([grid.min(axis=0), grid.max(axis=0)], [[-1.0, 0.0], [3.0, 1.0]])
 
 
 class Drift(gymnasium.Env):

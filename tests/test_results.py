@@ -205,6 +205,14 @@ def test_kept_policies_stand_beside_the_newest_and_the_best_of_their_runs(made):
     lines.loc[ended, "value"] = [40, 40, 40, 93]
     lines.to_csv(made / "iterations.csv", index=False)
     assert kept_table(read_study(made)).loc[0, "within 3 % of the best"] == "3 of 4"
+    # a run whose best is worse than the random policy keeps it, or does not
+    lines.loc[ended, ["value", "value_newest"]] = [[-40, -40], [-40, -60], [-40, -60], [-40, -60]]
+    lines.to_csv(made / "iterations.csv", index=False)
+    assert kept_table(read_study(made)).loc[0, "within 3 % of the best"] == "4 of 4"
+    lines.loc[ended, "value"] = [-40, -60, -60, -60]
+    lines.loc[lines["seed"] == 1, "value_newest"] = 11.0
+    lines.to_csv(made / "iterations.csv", index=False)
+    assert kept_table(read_study(made)).loc[0, "within 3 % of the best"] == "3 of 4"
 
 
 def test_pairs_of_trials_are_counted_by_the_answers_that_they_needed(made):
@@ -219,6 +227,33 @@ def test_pairs_of_trials_are_counted_by_the_answers_that_they_needed(made):
     assert (second["fewer to 50 for good"], second["more to 50 for good"]) == ("1", "3")
     declared.write_text(declared.read_text().replace("good_above = 50", "good_above = 99"))
     assert pairs_table(read_study(made)).loc[0, "median to 99"] == "never against never"
+
+
+def test_a_trial_whose_first_policy_comes_late_does_not_delay_the_others_of_its_row(made):
+    declared = made / "study.toml"
+    declared.write_text(declared.read_text().replace("[tasks.gridworld]", "[tasks.gridworld]\ngood_above = 5"))
+    lines = pd.read_csv(made / "iterations.csv")
+    lines.loc[(lines["methods"] == "second") & (lines["seed"] == 2), "answers"] += 3  # its expert skipped questions
+    lines.to_csv(made / "iterations.csv", index=False)
+    (second,) = pairs_table(read_study(made)).to_dict("records")
+    for level in ("5", "5 for good"):
+        assert (second[f"median to {level}"], second[f"more to {level}"]) == ("2 against 2", "1")
+
+
+def test_of_iterations_with_as_many_answers_the_last_policy_counts(made):
+    declared = made / "study.toml"
+    declared.write_text(declared.read_text().replace("[tasks.gridworld]", "[tasks.gridworld]\ngood_above = 50"))
+    lines = pd.read_csv(made / "iterations.csv")
+    lines.loc[(lines["methods"] == "first") & (lines["iteration"] > 2), "answers"] = 4  # 90 and 97, but 96 and 20
+    lines.to_csv(made / "iterations.csv", index=False)
+    (second,) = pairs_table(read_study(made)).to_dict("records")
+    assert second["more to 50 for good"] == "3"
+
+
+def test_a_baseline_does_not_define_the_scale():
+    text = DECLARATION + '[methods.pf]\nbaseline = "pf"\nutility = "known-reward"\n'
+    rows = {row.name: row.of_scale for row in parsed(text, "made").rows}
+    assert (rows["gridworld/known"], rows["gridworld/random"], rows["gridworld/pf"]) == (True, True, False)
 
 
 def test_predictions_are_pooled_over_tasks_and_not_over_methods():

@@ -88,8 +88,12 @@ def test_every_cell_is_a_run_directory_and_the_table_has_a_line_for_each_iterati
 
 
 def test_an_untrained_cell_has_the_value_of_the_first_policy(finished):
-    learner = runs.resume(finished / "gridworld/random/none/seed-2980")
-    kept = json.loads((finished / "gridworld/random/none/seed-2980/first-policy.json").read_text())
+    options = {"preset": "paper", "iterations": 2, "max_steps": 10, "evaluation_episodes": 2}
+    learner = bayespbrl.Learner("gridworld", seed=2980, **options)
+    cell = finished / "gridworld/random/none/seed-2980"
+    kept = json.loads((cell / "first-policy.json").read_text())
+    with pytest.raises(ValueError, match="expected a run of the learner, got a trial of a policy that does not learn"):
+        runs.resume(cell)
     assert kept["value"] == pytest.approx(float(learner.cycle.evaluated(learner.policy).total.mean()))
 
 
@@ -152,6 +156,11 @@ def test_a_study_that_was_killed_as_it_began_can_be_begun_again(tmp_path):
     (tmp_path / "study").mkdir()
     (tmp_path / "study" / "study.toml").write_text(DECLARATION)
     assert Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "study").finished == 0
+    (tmp_path / "study" / "study.json.12-abcdef01.part").touch()  # while it wrote, or while another command writes
+    assert Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "study").finished == 0
+    (tmp_path / "study" / "study.json.old").touch()
+    with pytest.raises(ValueError, match="expected the directory of a study"):
+        Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "study")
 
 
 def test_the_time_of_a_baseline_is_known(tmp_path, monkeypatch):

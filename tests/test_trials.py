@@ -176,8 +176,11 @@ def test_a_second_call_keeps_finished_trials_and_goes_on_with_unfinished_ones(st
 
 
 def test_a_directory_with_other_settings_is_refused(study):
-    with pytest.raises(ValueError, match="expected a trial with these settings"):
+    wrong = f"expected a trial with these settings, got others: iterations {QUICK['iterations']} instead of 3$"
+    with pytest.raises(ValueError, match=wrong):
         run_trials("gridworld", study.path, seeds=range(5, 7), **(QUICK | {"iterations": 3}))
+    with pytest.raises(ValueError, match=wrong):  # all but the first seed differ from the row's
+        rows.row_of("gridworld", study.path, QUICK | {"iterations": 3}, seed=5).outcome(6)
 
 
 # A single step from the centre of the grid often brings three times the same reward: in seeds 6 and 7 the first answers

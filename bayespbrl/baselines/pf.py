@@ -20,6 +20,7 @@ Decisions, where the sources are silent or differ:
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -54,10 +55,7 @@ def programming_by_feedback(
       ValueError: an environment whose transition probabilities are not known.
     """
     environment = open_environment(environment)
-    dynamics: Any = getattr(environment.unwrapped, "dynamics", None)
-    if not hasattr(dynamics, "transition_table"):
-        raise ValueError(f"baseline pf: expected a task with a known transition_table, got {environment}")
-    table, steps = np.asarray(dynamics.transition_table()), step_limit(environment, max_steps)
+    table, steps = transition_table(environment), step_limit(environment, max_steps)
     rng = np.random.default_rng([seed, 0])
     points = rng.standard_normal((DRAWS, len(table)))  # the prior
     differences: list[np.ndarray] = []
@@ -84,6 +82,14 @@ def programming_by_feedback(
         yield Step(given, len(differences), tabular(planned(table, mean[None])[0], table.shape[1]))
         if given == answers:
             return
+
+
+def transition_table(environment: gymnasium.Env) -> Float[np.ndarray, "s a s"]:
+    """P(s′ | s, a), known; `ValueError` for a task that does not tell it."""
+    dynamics: Any = getattr(environment.unwrapped, "dynamics", None)
+    if not hasattr(dynamics, "transition_table"):
+        raise ValueError(f"baseline pf: expected a task with a known transition_table, got {environment}")
+    return np.asarray(dynamics.transition_table())
 
 
 def preferred_probability(margins: Float[np.ndarray, "..."], width: float = ERROR_WIDTH) -> Float[np.ndarray, "..."]:

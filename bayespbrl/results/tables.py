@@ -150,10 +150,13 @@ def pairs_table(data: StudyData) -> pd.DataFrame:
 
 def _answers_above(row: RowData, level: float, *, for_good: bool = False) -> np.ndarray:
     """Answers of each trial by which its kept policy is better than `level`, infinity for never, shape (S,)."""
-    better = row.values > level
-    if for_good:
-        better = np.flip(np.logical_and.accumulate(np.flip(better, 1), axis=1), 1)
-    return np.where(better.any(axis=1), row.answers[better.argmax(axis=1)], np.inf)
+    found = []
+    for _, trial in row.lines.drop_duplicates(["seed", "answers"], keep="last").groupby("seed"):
+        better = trial["value"].to_numpy() > level
+        if for_good:
+            better = np.logical_and.accumulate(better[::-1])[::-1]
+        found.append(float(trial["answers"].to_numpy()[better.argmax()]) if better.any() else np.inf)
+    return np.array(found)
 
 
 def _number(value: float) -> str:
@@ -212,7 +215,7 @@ def kept_table(data: StudyData) -> pd.DataFrame:
         kept, newest, best = row.final, trials.last().to_numpy(), trials.max().to_numpy()
         others += int((kept != newest).sum())
         floor = data.floor(row.declared.levels[0])
-        close = None if floor is None else best - kept <= CLOSE * (best - floor)
+        close = None if floor is None else best - kept <= CLOSE * np.maximum(best - floor, 0)
         lines.append(
             dict(zip(AXES, row.declared.levels, strict=True))
             | {"trials": str(len(kept)), "kept": _median_and_quartile(kept), "worst": f"{kept.min():.4g}"}

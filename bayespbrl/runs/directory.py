@@ -25,6 +25,7 @@ from bayespbrl.settings import OPTIONS, Settings
 
 FORMAT = 3  # format 2 had one setting's posterior beside an average; format 1 named classes by their modules
 HEAVY = ("collected", "improved")  # events with heavy parts, in the file of their iteration
+BASELINE_FILE, FIRST_POLICY_FILE = "baseline.json", "first-policy.json"  # of a study's trials that do not learn so
 Event = dict[str, Any]
 
 
@@ -92,6 +93,12 @@ class RunDirectory:
             return cls(path, Settings.from_options(content["env"], known))
         except (TypeError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
+
+    def check_learner(self) -> None:
+        """`ValueError` where the directory is a study's trial of a baseline, or of a policy that does not learn."""
+        for name, what in ((BASELINE_FILE, "a baseline"), (FIRST_POLICY_FILE, "a policy that does not learn")):
+            if (self.path / name).exists():
+                raise ValueError(f"{self.path}: expected a run of the learner, got a trial of {what}: see its {name}")
 
     def check_newest(self) -> None:
         """`ValueError` where another learner has written to the run since this one's last event."""

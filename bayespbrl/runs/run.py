@@ -74,6 +74,7 @@ def resume(
         directory that is no run or cannot be written, or a file in it that is truncated or foreign.
     """
     log = RunDirectory.open(directory)
+    log.check_learner()
     if env is None and not import_package:
         check_permission(log.settings.env, log.path)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
@@ -100,6 +101,7 @@ def load(
     A schedule and a query rule of your own are needed only to continue a run, not to read it.
     """
     log = RunDirectory.open(directory)
+    log.check_learner()
     if env is None and not import_package:
         check_permission(log.settings.env, log.path)
     if log.settings.update.schedule == "other" and schedule is None:

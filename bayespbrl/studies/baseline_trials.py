@@ -7,10 +7,9 @@ from typing import Any
 
 from bayespbrl.baselines import BASELINES
 from bayespbrl.learner import Learner
+from bayespbrl.runs.directory import BASELINE_FILE
 from bayespbrl.runs.files import write_file
 from bayespbrl.runs.simulated import expert_of
-
-BASELINE_FILE = "baseline.json"
 
 
 def measure_baseline(learner: Learner, name: str, directory: Path) -> None:

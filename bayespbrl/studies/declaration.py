@@ -83,7 +83,7 @@ class DeclaredRow:
     @property
     def of_scale(self) -> bool:
         """Whether the row is an end of the relative value's scale: the random policy, or learning from the reward."""
-        return self.untrained or self.options.get("utility") == "known-reward"
+        return self.untrained or (self.baseline is None and self.options.get("utility") == "known-reward")
 
 
 @dataclass(frozen=True)

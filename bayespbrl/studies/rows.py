@@ -13,14 +13,13 @@ from bayespbrl.envs.opening import environment_name, open_environment
 from bayespbrl.experts import SIMULATED
 from bayespbrl.learner import Learner
 from bayespbrl.runs import run as runs
-from bayespbrl.runs.directory import RunDirectory, read_summary
+from bayespbrl.runs.directory import BASELINE_FILE, FIRST_POLICY_FILE, RunDirectory, read_summary
 from bayespbrl.runs.lock import continuing
 from bayespbrl.runs.simulated import expert_of
 from bayespbrl.settings import Settings, Task, settings_for
-from bayespbrl.studies.baseline_trials import BASELINE_FILE, measure_baseline, read_baseline
+from bayespbrl.studies.baseline_trials import measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
     BALANCING_FILE,
-    FIRST_POLICY_FILE,
     collect,
     collect_first_policies,
     measure_balancing,
@@ -83,8 +82,8 @@ class Row:
             done = read_summary(path)["iterations"] if (path / "summary.json").exists() else []
         except ValueError as error:
             raise DamagedTrial(str(error)) from error
-        if kept.settings != replace(self.settings, seed=seed):
-            pairs = zip(kept.settings.options().items(), self.settings.options().values(), strict=True)
+        if kept.settings != (wanted := replace(self.settings, seed=seed)):
+            pairs = zip(kept.settings.options().items(), wanted.options().values(), strict=True)
             others = [f"{name} {kept!r} instead of {here!r}" for (name, kept), here in pairs if kept != here]
             raise ValueError(f"{path}: expected a trial with these settings, got others: {', '.join(others)}")
         if self.untrained or self.baseline is not None:

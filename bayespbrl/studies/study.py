@@ -22,11 +22,13 @@ from typing import Any
 import pandas as pd
 
 from bayespbrl import checks
-from bayespbrl.runs.files import write_file
+from bayespbrl.baselines import NEEDED
+from bayespbrl.envs.opening import open_environment
+from bayespbrl.runs.files import ASIDE, write_file
 from bayespbrl.studies.declaration import AXES, Declaration, parsed
 from bayespbrl.studies.engine import Engine, Failure, Progress
 from bayespbrl.studies.machine import machine, rounding, source_digest
-from bayespbrl.studies.rows import DamagedTrial, Seeds, collected, row_of, seconds_of
+from bayespbrl.studies.rows import DamagedTrial, Row, Seeds, collected, row_of, seconds_of
 from bayespbrl.studies.tables import took_place
 from bayespbrl.studies.trials import executor_for
 
@@ -91,8 +93,7 @@ class Study:
                     untrained=declared.untrained,
                     name=declared.name,
                 )
-                if declared.baseline is not None and row.settings.questions.clip_steps is not None:
-                    raise ValueError("clip_steps: expected none, because a baseline compares whole trajectories")
+                _check_baseline(declared.baseline, row)
             except ValueError as error:
                 raise ValueError(f"study {declaration.name}, {declared.name}: {error}") from error
             seeds = Seeds(replace(row, baseline=declared.baseline), number)
@@ -250,13 +251,25 @@ def _table_of(levels: tuple[str, ...], seeds: Seeds) -> pd.DataFrame:
     return lines.reindex(columns=[*AXES, "seed", "iteration", *FIGURES])
 
 
+def _check_baseline(baseline: str | None, row: Row) -> None:
+    """Check that a row's task and options suit its baseline, if it has one."""
+    if baseline is None:
+        return
+    if row.settings.questions.clip_steps is not None:
+        raise ValueError("clip_steps: expected none, because a baseline compares whole trajectories")
+    environment = open_environment(row.env)
+    NEEDED[baseline](environment)
+    environment.close()
+
+
 def _check_same(declaration: Declaration, directory: Path) -> None:
     """Check that a directory is new, or holds this study by this version."""
     if not directory.exists():
         return
     if not directory.is_dir():
         raise ValueError(f"{directory}: expected a directory for the study, got a file")
-    if {path.name for path in directory.iterdir()} <= {"study.toml"}:  # empty, or stopped as it began
+    names = (path.name for path in directory.iterdir())
+    if {name for name in names if not ASIDE.search(name)} <= {"study.toml"}:  # empty, or stopped as it began
         return
     kept = read_study_json(directory)
     if kept.get("version") != version("bayespbrl"):

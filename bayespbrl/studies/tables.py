@@ -12,14 +12,13 @@ import xarray as xr
 from bayespbrl import rollouts
 from bayespbrl.envs import bicycle
 from bayespbrl.learner import Learner
-from bayespbrl.runs.directory import read_complete_summary
+from bayespbrl.runs.directory import FIRST_POLICY_FILE, read_complete_summary
 from bayespbrl.runs.files import write_file, write_netcdf
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value", "value_newest")
 
 BALANCING_FILE = "balancing.json"
 BALANCING_EPISODES = 100
-FIRST_POLICY_FILE = "first-policy.json"  # of a trial that does not learn: the random policy
 
 
 def collect(

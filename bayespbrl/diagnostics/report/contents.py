@@ -152,6 +152,7 @@ def read_contents(
       ValueError: a directory that is no run, or one of a newer version.
     """
     run = RunDirectory.open(directory)
+    run.check_learner()
     log = read_log(run.path, run.settings)
     contents = RunContents(
         path=run.path,

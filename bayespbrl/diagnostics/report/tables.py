@@ -239,7 +239,9 @@ def _states_to_show(
         shape = contents.environment_attribute("grid_shape")
         return np.arange(number), {"kind": "list"} if shape is None else {"kind": "grid", "shape": tuple(shape)}
     if states.shape[1] <= 2:
-        lines = [np.linspace(low, high, RESOLUTION) for low, high in zip(states.min(0), states.max(0), strict=True)]
+        least, most = states.min(axis=0), states.max(axis=0)
+        beside = 0.5 * (least == most)  # a map has a height where a dimension is constant, too
+        lines = [np.linspace(*ends, RESOLUTION) for ends in zip(least - beside, most + beside, strict=True)]
         grid = np.stack([axis.ravel() for axis in np.meshgrid(*lines)], axis=1)
         return grid, {"kind": "line"} if len(lines) == 1 else {"kind": "plane", "shape": (RESOLUTION, RESOLUTION)}
     spread = np.quantile(states, 0.9, axis=0) - np.quantile(states, 0.1, axis=0)

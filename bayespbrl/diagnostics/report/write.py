@@ -92,7 +92,7 @@ def assembled(contents: RunContents) -> Report:
         *([("people", "People", lambda: people_section(contents))] if has_people(contents) else []),
         ("calibration", "Calibration of the predictions", lambda: sections.calibration(contents, scores)),
         ("updates", "Policy updates", lambda: sections.updates(iterations)),
-        ("sensitivity", "Sensitivity to σ and m", lambda: sections.sensitivity_to_model(contents)),
+        ("sensitivity", "Sensitivity to prior and likelihood", lambda: sections.sensitivity_to_model(contents)),
         ("iterations", "All iterations", lambda: sections.all_iterations(iterations)),
     ]
     failures: list[ReportWarning] = []
