@@ -66,7 +66,7 @@ def share(name: str, value: Any, *, below_one: bool = False) -> float:
 
 def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     """`value`, where it is one of `choices`."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
     return str(value)
 
@@ -171,5 +171,5 @@ def _shortened(values: Any) -> str:
 
 
 def _is_number(value: Any) -> bool:
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool | np.timedelta64)
     return number and -sys.float_info.max <= value <= sys.float_info.max  # a whole number may be larger than any float

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import gymnasium
 import numpy as np
 
-from bayespbrl import events, queries
+from bayespbrl import checks, events, queries
 from bayespbrl.cycle import Cycle
 from bayespbrl.envs import opening
 from bayespbrl.envs.opening import AnyEnvironment
@@ -184,14 +184,18 @@ class Learner:
 
     # Ask and tell.
 
-    def ask(self) -> list[Query]:
+    def ask(self, *, answerer: str | None = None) -> list[Query]:
         """The question that waits for an answer, after doing whatever comes before it; empty when finished.
 
         Each new trajectory is compared with the best of all before it, so there is one question at a time. Where
-        several people answered at once, all questions that they left wait, as far as the budget goes.
+        several people answered at once, all questions that they left wait, as far as the budget goes. With `answerer`,
+        the name of who answers next, it is one that they may answer: another person's repeated question stays open.
         """
+        if answerer is not None:
+            query = self._question_for(checks.short_name("answerer", answerer))
+            return [] if query is None else [query]
         self._advance()
-        return self._waiting()
+        return self.state.waiting(self.settings)
 
     def tell(
         self, answers: Sequence[Answer | str], *, answerer: str | None = None, seconds: float | None = None
@@ -200,7 +204,7 @@ class Learner:
 
         Args:
           answers: one, to the question that `ask` returned.
-          answerer: name of who gave it, printable, at most 64 characters; each of several has a lapse rate.
+          answerer: name of who gave it, whom `ask` was told; at most 64 characters. Each of several has a lapse rate.
           seconds: how long they took, which is kept beside the answer.
 
         Raises:
@@ -208,23 +212,25 @@ class Learner:
             happened then. Or what follows the answer fails, as the environment may: the answer is kept, and `ask` tries
             again.
         """
-        self._take_in(self._waiting(), answers, answerer, seconds)
+        waiting = self.state.waiting(self.settings, answerer)
+        one = answerer is not None and isinstance(answers, Sequence) and len(answers) == 1
+        self._take_in(waiting[:1] if one else waiting, answers, answerer, seconds)
         self._advance()
 
     def _take_in(
         self, waiting: Sequence[Query], answers: Sequence[Answer | str], answerer: str | None, seconds: float | None
     ) -> None:
         if isinstance(answers, str) or not isinstance(answers, Sequence) or len(answers) != len(waiting):
-            raise ValueError(f"tell: expected a list of {len(waiting)} answers, one to each question, got {answers!r}")
+            by = "ask()" if answerer is None else f"ask(answerer={answerer!r})"
+            raise ValueError(f"tell: expected a list of {len(waiting)} answers, one to each of {by}, got {answers!r}")
         parsed = [parse_answer(answer) for answer in answers]
         if Answer.UNDO in parsed and len(parsed) > 1:
             raise ValueError(
                 f"tell: expected undo() while several questions wait, got an undo among the answers {answers!r}"
             )
-        numbers = [query.number for query in waiting]
         entries = [
-            events.answered(number, answer, answerer=answerer, seconds=seconds)
-            for number, answer in zip(numbers, parsed, strict=True)
+            events.answered(query.number, answer, answerer=answerer, seconds=seconds)
+            for query, answer in zip(waiting, parsed, strict=True)
         ]
         for entry, answer in zip(entries, parsed, strict=True):
             if answer is Answer.UNDO:
@@ -259,7 +265,7 @@ class Learner:
             that waits for another person is left open.
           progress: called after each iteration, those that ask nothing among them.
         """
-        if not callable(expert):
+        if not callable(expert) or isinstance(expert, type):
             raise ValueError(f"expert: expected a function of two trajectories, got {expert!r}")
         self._advance(progress)
         vain = 0
@@ -275,12 +281,11 @@ class Learner:
                 self._advance(progress)
         return self
 
-    def _question_for(self, answerer: str | None, progress: Callable[["Learner"], None] | None) -> Query | None:
+    def _question_for(self, answerer: str | None, progress: Callable[["Learner"], None] | None = None) -> Query | None:
         """The question for a person, asked if need be; None when finished."""
         while not self.finished:
-            for query in self.state.open if self._waiting() else ():
-                if self.state.may_answer(query, answerer, self.settings):
-                    return query
+            if waiting := self.state.waiting(self.settings, answerer):
+                return waiting[0]
             entry = self.cycle.next(self.state, answerer, others=0)  # past the questions of others
             if entry is None:
                 return None
@@ -310,11 +315,6 @@ class Learner:
         except ImportError as error:
             raise ValueError(f"widget: expected the extra people (pip install '.[people]'), got {error}") from error
         return ComparisonWidget(self, most_answers=answers, answerer=answerer, practice=practice)
-
-    def _waiting(self) -> list[Query]:
-        """The open questions, no more than the budget has answers left."""
-        left = self.state.left(self.settings)
-        return [] if self.finished else [query for place, query in enumerate(self.state.open) if place < left]
 
     def _advance(self, progress: Callable[["Learner"], None] | None = None) -> None:
         """Do what can be done without an answer; `progress` is called after each iteration."""

@@ -82,7 +82,7 @@ def test_a_bad_name_is_refused_and_nothing_has_happened(answerer):
         apply(state, Entry({"event": "answered", "query": 1, "answer": "tie", "answerer": answerer}))
 
 
-@pytest.mark.parametrize("seconds", [-1, float("nan"), float("inf"), "3", True, [1.0]])
+@pytest.mark.parametrize("seconds", [-1, float("nan"), float("inf"), "3", True, [1.0], np.timedelta64(2, "s")])
 def test_a_bad_response_time_is_refused_and_nothing_has_happened(seconds):
     run, log = remembered()
     run.ask()
@@ -172,7 +172,7 @@ def test_nobody_has_answered_a_new_run_and_an_answer_without_a_name_is_somebodys
 def answering(run, choose, number=100, **who):
     """Answer at most `number` questions by `choose`, and return them."""
     asked = []
-    while len(asked) < number and (questions := run.ask()):
+    while len(asked) < number and (questions := run.ask(answerer=who.get("answerer"))):
         asked.append(questions[0])
         run.tell([choose(questions[0])], **who)
     return asked
@@ -239,6 +239,39 @@ def test_repeated_questions_stay_within_the_budget_and_are_of_the_one_who_answer
     past = {question.number: question for question in run.state.past}
     later = [query for query in asked[1:] if query.repeats is not None]
     assert all(past[query.repeats].answerer == "Bob" for query in later)
+
+
+def test_people_who_take_turns_are_asked_again_what_they_answered_themselves():
+    run, _ = remembered(**PEOPLE, repeats=0.3, answers=24)
+    names = {}
+    while questions := run.ask(answerer=(name := ("Ada", "Ben")[len(names) % 2])):
+        (query,) = questions
+        names[query.number] = name
+        if query.repeats is not None:
+            assert names[query.repeats] == name
+        run.tell(["first"], answerer=name)
+    assert {past.number: past.answerer for past in run.state.past} == names
+    assert len(names) > 12
+    repeats = [past.answerer for past in run.state.past if past.repeats is not None]
+    assert {"Ada", "Ben"} == set(repeats)
+
+
+def test_an_answer_to_a_question_that_waits_for_another_person_is_refused():
+    run, _ = remembered(**PEOPLE, repeats=0.3, answers=24)
+    while run.ask()[0].repeats is None:
+        run.tell(["first"], answerer="Ada")
+    with pytest.raises(
+        ValueError, match=r"tell: expected a list of 0 answers, one to each of ask\(answerer='Ben'\), got"
+    ):
+        run.tell(["first"], answerer="Ben")
+    (query,) = run.ask(answerer="Ben")
+    assert query.repeats is None
+    assert len(run.ask()) == 2
+    run.tell(["second"], answerer="Ben")
+    assert run.state.past[-1].number == query.number
+    assert run.ask(answerer="Ada")[0].repeats is not None
+    with pytest.raises(ValueError, match="answerer: expected"):
+        run.ask(answerer=" ")
 
 
 def test_of_several_people_nobody_is_asked_again_what_they_were_asked_just_now():

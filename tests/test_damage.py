@@ -185,4 +185,8 @@ def test_an_expert_that_is_no_function_is_named_before_anything_happens(tmp_path
     learner = bayespbrl.start("gridworld", tmp_path / "run", preset="paper", max_steps=5)
     with pytest.raises(ValueError, match="expert: expected a function of two trajectories, got 'return'"):
         learner.run("return")
+    with pytest.raises(ValueError, match="expert: expected a function of two trajectories, got <class"):
+        learner.run(bayespbrl.ReturnExpert)  # and not an instance
+    with pytest.raises(ValueError, match=r"expert: expected one of return, .*, got array"):
+        bayespbrl.Learner("gridworld", expert=np.zeros(2))
     assert not RunDirectory.open(tmp_path / "run").log_file.exists()

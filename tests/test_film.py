@@ -89,6 +89,15 @@ def test_an_environment_that_renders_itself_is_filmed_step_by_step(tmp_path, env
     assert isinstance(env, str) or not env.closed  # the user's own stays open
 
 
+def test_the_film_of_a_name_lasts_as_long_as_the_run_says_and_not_as_registered(tmp_path):
+    gymnasium.register("bayespbrl-tests/Short-v0", Counter, max_episode_steps=4, kwargs={"length": 99})
+    try:
+        shown = frames_of(film_policy(Learner("bayespbrl-tests/Short-v0", max_steps=9, **QUICK), tmp_path)[0])
+    finally:
+        del gymnasium.registry["bayespbrl-tests/Short-v0"]
+    assert [brightness for brightness, _ in shown] == list(range(10))
+
+
 def test_a_long_episode_is_thinned_out_evenly_and_keeps_its_end(tmp_path):
     learner = Learner(Counter("rgb_array", length=250), max_steps=300, **QUICK)
     brightness, durations = zip(*frames_of(film_policy(learner, tmp_path)[0]), strict=True)

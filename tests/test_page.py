@@ -330,6 +330,49 @@ def test_a_page_that_is_not_answered_for_long_says_what_to_do_and_goes_on_when_i
         assert answers_of(gridworld) == ["second"]
 
 
+def test_a_key_answers_no_question_whose_clips_are_not_on_the_screen_yet(browser, gridworld):
+    slow = """() => {
+      const decoded = window.createImageBitmap;
+      window.createImageBitmap = async (...sheet) => {
+        await new Promise((done) => setTimeout(done, window.delay ?? 0));
+        return decoded(...sheet);
+      };
+    }"""
+    with tab(browser, gridworld) as opened, tab(browser, gridworld) as other:
+        opened.evaluate(slow)
+        opened.evaluate("window.delay = 1500")
+        turn = turn_of(opened)
+        press(other, "second")
+        opened.wait_for_selector(f".bp-box[data-locked=true][data-turn='{turn}']")  # the next question is on its way
+        opened.keyboard.press("ArrowLeft")
+        opened.wait_for_selector(f"{READY}[data-turn='{turn + 1}']")
+        assert answers_of(gridworld) == ["second"]
+        press(opened, "tie")
+        assert answers_of(gridworld) == ["second", "tie"]
+
+
+def test_a_connection_that_dies_without_a_word_is_opened_again(browser, gridworld, monkeypatch):
+    monkeypatch.setattr("bayespbrl.people.page.HEARTBEAT", 0.1)
+    asked = []
+
+    def before(opened):
+        opened.clock.install()
+        opened.on("request", lambda request: asked.append(request.url) if request.url.endswith("events") else None)
+
+    with tab(browser, gridworld, before=before) as opened:
+        for _ in range(4):
+            opened.clock.fast_forward(20_000)
+            opened.wait_for_timeout(500)  # signs of life come meanwhile
+        assert len(asked) == 1
+        monkeypatch.setattr("bayespbrl.people.page.HEARTBEAT", 1000.0)
+        opened.wait_for_timeout(500)
+        opened.clock.fast_forward(26_000)
+        until(opened, lambda: opened.clock.fast_forward(1000) or len(asked) == 2)
+        opened.wait_for_selector(".bp-note", state="hidden")
+        press(opened, "second")
+        assert answers_of(gridworld) == ["second"]
+
+
 @pytest.mark.parametrize("heard", [False, True])
 def test_an_answer_whose_connection_is_lost_is_sent_again_and_counts_once(browser, gridworld, heard):
     """The request is lost, or (`heard`) its reply."""

@@ -12,6 +12,8 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box, Discrete
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from toys import Push
 
 import bayespbrl
@@ -349,6 +351,53 @@ def test_an_environment_may_change_its_actions_and_give_any_infos(meddling, by_n
     episodes = rollout(env, policy, key=KEY, episodes=6, max_steps=8)
     assert all(np.all(episode.actions == 0.5) for episode in episodes)
     assert all(np.all(episode.states.sum(axis=1) == 1) for episode in episodes)
+
+
+class Counting(gymnasium.Env):
+    """Counts its steps, and rewards with their number."""
+
+    observation_space, action_space = Box(-10, 10, (1,), np.float64), Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0.0
+        return np.zeros(1), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.array([self.t]), self.t, False, False, {}
+
+
+class CountingSideBySide(VectorEnv):
+    """Many of them, which return their own arrays, and write to them anew."""
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 (gymnasium's interface)
+    single_observation_space, single_action_space = Counting.observation_space, Counting.action_space
+
+    def __init__(self, num_envs=1, max_episode_steps=5):
+        self.num_envs = num_envs
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.seen, self.reward, self.ended = np.zeros((num_envs, 1)), np.zeros(num_envs), np.zeros(num_envs, bool)
+
+    def reset(self, *, seed=None, options=None):
+        self.seen[:] = 0
+        return self.seen, {}
+
+    def step(self, actions):
+        self.seen += 1
+        self.reward[:] = self.seen[:, 0]
+        return self.seen, self.reward, self.ended, self.ended, {}
+
+
+def test_arrays_that_a_vector_environment_writes_to_anew_are_copied():
+    gymnasium.register("Counting-v0", entry_point=Counting, vector_entry_point=CountingSideBySide, max_episode_steps=5)
+    try:
+        for episode in rollout("Counting-v0", Coin(np.array(0.5)), key=KEY, episodes=2):
+            np.testing.assert_array_equal(episode.states[:, 0], range(6))
+            np.testing.assert_array_equal(episode.rewards, range(1, 6))
+    finally:
+        del gymnasium.registry["Counting-v0"]
 
 
 def test_what_random_actions_do_is_measured_up_to_the_limit_that_is_asked_for():

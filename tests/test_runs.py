@@ -786,6 +786,20 @@ def test_a_run_of_an_object_of_a_registered_environment_goes_on_bit_for_bit(tmp_
     assert fingerprint(resumed) == fingerprint(whole)
 
 
+def test_an_object_that_was_changed_since_it_was_made_is_asked_for_again(tmp_path):
+    env = gymnasium.make("Pendulum-v1")
+    env.unwrapped.g = 0.0
+    learner = bayespbrl.start(env, tmp_path / "run", **QUICK | {"max_steps": 5})
+    assert learner.settings.environment == "other"
+    with pytest.raises(ValueError, match="expected env= again"):
+        bayespbrl.load(tmp_path / "run")
+    assert bayespbrl.load(tmp_path / "run", env=env).learner.environment.unwrapped.g == 0
+    used = gymnasium.make("Pendulum-v1")
+    used.reset(seed=5)
+    used.step(np.ones(1))
+    assert bayespbrl.Learner(used, **QUICK | {"max_steps": 5}).settings.environment == "object"
+
+
 def test_a_run_of_an_object_that_nobody_registers_any_more_is_one_line(tmp_path):
     gymnasium.register("Gone-v0", entry_point=Corridor, max_episode_steps=5)
     try:

@@ -16,6 +16,9 @@ import numpy as np
 import pytest
 from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.spaces import Box, Discrete
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import RecordEpisodeStatistics
 from PIL import Image, ImageDraw
 from toys import QUICK, Slope, fingerprint
 
@@ -571,8 +574,52 @@ def test_an_environment_whose_wrapper_gives_other_observations_is_not_drawn_from
     assert scene_of(open_environment(wrapper(gymnasium.make("Pendulum-v1")))) is None
 
 
-def test_an_environment_that_renders_is_filmed_by_itself():
-    clips = clips_of(Camera())
+class Scaled(gymnasium.Wrapper):
+    """Other observations in the same space, by a wrapper of gymnasium's most general kind."""
+
+    def reset(self, **arguments):
+        observation, info = self.env.reset(**arguments)
+        return observation / 2, info
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        return observation / 2, *rest
+
+
+class Strong(gymnasium.ActionWrapper):
+    def action(self, action):
+        return 2 * action
+
+
+class Cautious(gymnasium.RewardWrapper):
+    def reward(self, reward):
+        return reward - 1
+
+
+class Noting(gymnasium.Wrapper):
+    """Changes nothing."""
+
+    note = "of the user's"
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "drawn"),
+    [(Scaled, False), (Strong, True), (Cautious, True), (Noting, True), (RecordEpisodeStatistics, True)],
+)
+def test_an_environment_is_drawn_where_no_wrapper_touches_its_observations(wrapper, drawn):
+    env = open_environment(wrapper(gymnasium.make("Pendulum-v1")))
+    assert (scene_of(env) is not None) is drawn
+
+
+class Single(Camera):
+    """Returns more digits than its space has."""
+
+    observation_space = Box(-10.0, 10.0, (1,))
+
+
+@pytest.mark.parametrize("env", [Camera(), Single()])
+def test_an_environment_that_renders_is_filmed_by_itself(env):
+    clips = clips_of(env)
     assert {(clip.width, clip.height, clip.frames) for clip in clips} == {(90, 60, 21)}
     assert all(clip.sheet.startswith(b"\xff\xd8") for clip in clips)  # JPEG: many colours
 
@@ -628,6 +675,38 @@ def test_where_an_episode_cannot_be_filmed_a_warning_says_why_there_are_plots(en
     with pytest.warns(UserWarning, match=f"{type(env).__name__} is not rendered but plotted: {reason}"):
         clips = clips_of(env)
     assert {(clip.width, clip.height) for clip in clips} == {(440, 400)}
+
+
+class SideBySide(VectorEnv):
+    """Cameras that share random numbers, as a vector version of its own may."""
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 (gymnasium's interface)
+    single_observation_space, single_action_space = Camera.observation_space, Camera.action_space
+
+    def __init__(self, num_envs=1, max_episode_steps=None, render_mode=None):
+        self.num_envs, self.ended = num_envs, np.zeros(num_envs, bool)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.normal(size=(self.num_envs, 1)), {}
+
+    def step(self, actions):
+        return self.np_random.normal(size=(self.num_envs, 1)), np.zeros(self.num_envs), self.ended, self.ended, {}
+
+
+def test_where_a_vector_version_collects_the_warning_names_it():
+    class Plain(Camera):
+        action_space = Discrete(2)
+
+    SideBySide.single_action_space = Plain.action_space
+    gymnasium.register("Cameras-v0", entry_point=Plain, vector_entry_point=SideBySide, max_episode_steps=20)
+    try:
+        with pytest.warns(UserWarning, match="plotted: its own vector version, which collects, shares random numbers"):
+            clips_of("Cameras-v0", max_steps=None)
+    finally:
+        del gymnasium.registry["Cameras-v0"]
 
 
 def test_a_plot_names_the_observations_as_the_environment_does():
@@ -790,7 +869,9 @@ def held(directory):
         return True
 
 
-@pytest.mark.parametrize("options", [{"answers": 0}, {"answerer": ""}])
+@pytest.mark.parametrize(
+    "options", [{"answers": 0}, {"answerer": ""}, {"answerer": ["Ada", "Ben"]}, {"practice": "no"}]
+)
 def test_the_widget_refuses_bad_options(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         bayespbrl.Learner("gridworld", expert="other", **QUICK).widget(**options)

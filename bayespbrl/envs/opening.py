@@ -12,7 +12,17 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box, Discrete, Space
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformAction, TransformObservation
+from gymnasium.wrappers import (
+    HumanRendering,
+    OrderEnforcing,
+    PassiveEnvChecker,
+    RecordEpisodeStatistics,
+    RecordVideo,
+    RenderCollection,
+    TimeLimit,
+    TransformAction,
+    TransformObservation,
+)
 
 from bayespbrl import checks
 from bayespbrl.envs import SHORT_NAMES
@@ -21,6 +31,8 @@ from bayespbrl.envs.spaces import bounded, from_plain, plain_space, to_plain
 
 # Attributes of dynamics that are about their own observations.
 OF_OBSERVATIONS = ("observation_period", "observation_names", "draw", "draw_trajectory", "pose", "grid_shape")
+OF_MAKE = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
+ONLY_LOOKING = (*OF_MAKE, RecordEpisodeStatistics, RecordVideo, RenderCollection, HumanRendering)  # change nothing seen
 AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
 
 # Environments that we made from an id, and that can therefore be made again, N at a time.
@@ -96,12 +108,12 @@ def reopened(environment: object) -> str:
     """How the name alone opens the same environment again, by a value of the setting `environment`.
 
     `named`: by its name. `object`: made by gymnasium from its name; an object is stepped alone, where many copies of a
-    name are stepped side by side. `other`: not at all, since it was made with other arguments, wrapped, or never
-    registered.
+    name are stepped side by side. `other`: not at all, since it was made with other arguments, changed since, wrapped,
+    or never registered.
     """
     if isinstance(environment, str):
         return "named"
-    if not given_by_name(environment):
+    if not given_by_name(environment) or (isinstance(environment, gymnasium.Env) and _changed(environment)):
         return "other"
     stepped = isinstance(environment, gymnasium.Env) and not isinstance(environment.unwrapped, FunctionalEnv)
     return "object" if stepped else "named"
@@ -123,6 +135,26 @@ def given_by_name(environment: object) -> bool:
         for one in (spec, registered)
     ]
     return named[0].keys() == named[1].keys() and all(_same(named[0][name], named[1][name]) for name in named[0])
+
+
+def _changed(environment: gymnasium.Env) -> bool:
+    """Whether an attribute of an environment, as `g` of Pendulum, is no longer what gymnasium made of its name.
+
+    Compared are numbers, texts and arrays after a reset with the same seed. What cannot reset says so when it is used.
+    """
+    spec = environment.spec
+    assert spec is not None
+    again = _make(gymnasium.spec(spec.id))
+    try:
+        for one in (environment, again):
+            one.reset(seed=0)
+    except Exception:  # whatever an environment of the user's raises
+        return False
+    mine, made = vars(environment.unwrapped), vars(again.unwrapped)
+    again.close()
+    plain = (bool, int, float, str, np.ndarray, np.generic)
+    both = [name for name in mine.keys() & made.keys() if isinstance(mine[name], plain) and name != "render_mode"]
+    return not all(_same(mine[name], made[name]) for name in both if isinstance(made[name], plain))
 
 
 def identity(environment: object) -> str | None:
@@ -160,14 +192,21 @@ def environment_attribute(env: gymnasium.Env, name: str) -> Any:
 def observed_otherwise(env: gymnasium.Env) -> bool:
     """Whether a wrapper gives other observations than the environment itself."""
     given, inner = as_given(env), env.unwrapped
-    wrapped = any(isinstance(layer, gymnasium.ObservationWrapper) for layer in layers(given))
-    return wrapped or given.observation_space != inner.observation_space
+    *wrappers, _ = layers(given)
+    changed = not all(type(layer) in ONLY_LOOKING or _passes_observations(layer) for layer in wrappers)
+    return changed or given.observation_space != inner.observation_space
+
+
+def _passes_observations(wrapper: gymnasium.Env) -> bool:
+    """Whether a wrapper's steps and resets are those of gymnasium that leave observations alone, not its own."""
+    kinds = (gymnasium.Wrapper, gymnasium.ActionWrapper, gymnasium.RewardWrapper)
+    return all(getattr(type(wrapper), name) in {getattr(kind, name) for kind in kinds} for name in ("reset", "step"))
 
 
 def plainly_wrapped(env: gymnasium.Env) -> bool:
     """Whether all wrappers are those of `gymnasium.make`, which leave observations, actions and rewards alone."""
     *wrappers, _ = layers(env)
-    return all(type(layer) in (TimeLimit, OrderEnforcing, PassiveEnvChecker) for layer in wrappers)
+    return all(type(layer) in OF_MAKE for layer in wrappers)
 
 
 def layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:

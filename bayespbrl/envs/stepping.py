@@ -197,7 +197,7 @@ def _batch(
         check_observed(env, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
         # what idle lanes return must not reach the policy as NaN
         states.append(np.nan_to_num(_wide(seen, observations)))
-        rewards.append(np.asarray(reward, float))
+        rewards.append(np.array(reward, float))  # a copy: the environment may write to its own anew
         lengths += alive
         ended |= alive & terminated
         alive &= ~(terminated | truncated)

@@ -120,6 +120,12 @@ class LearnerState:
             return True
         return any(past.number == query.repeats and past.answerer == person for past in self.past)
 
+    def waiting(self, settings: Settings, person: str | None = None) -> list[Query]:
+        """The open questions that a person may answer, no more than the budget has answers left; None: anybody."""
+        left = 0 if self.finished(settings) else self.left(settings)
+        theirs = [query for query in self.open if self.may_answer(query, person, settings)]
+        return [query for place, query in enumerate(theirs) if place < left]
+
     def may_undo(self, person: str | None) -> bool:
         """Whether the last answer can be taken back, and is this person's, None without a name."""
         return bool(self.before) and self.past[-1].answerer == person

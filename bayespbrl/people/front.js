@@ -223,6 +223,7 @@ function render({ model, el }) {
     }
     if (loaded !== view.turn) {
       const load = ++loads, turn = view.turn;
+      lock(true); // the clips of another question are still on the screen
       const sheets = await Promise.all(["first", "second"].map((name) => createImageBitmap(new Blob([bytes(model.get(name))]))));
       if (load !== loads || !alive || view.turn !== turn || view.phase !== "question") return; // another view came meanwhile
       film.load(view.clips, sheets, view.rate);

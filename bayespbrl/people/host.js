@@ -7,6 +7,8 @@ const fire = (event, message) => (listeners[event] ?? []).forEach((callback) => 
 const pause = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 const GONE = "The program behind this page does not answer. If it has ended, start it again and open the address that it prints.";
 const ELSEWHERE = "This question was answered in another window, or by another person. That answer counts, and yours does not.";
+const SILENCE = 25; // seconds without a sign of life after which a connection is dead: page.py sends one every ten
+const REPLY = 15, CLIP = 60; // seconds within which the server replies, on a slow line too
 const PATIENCE = 20; // seconds without a server until the page says that it may have ended, and tries less often
 
 const model = {
@@ -26,6 +28,7 @@ async function post(message) {
         method: "POST",
         headers: { "Content-Type": "application/json", "Idempotency-Key": key },
         body: JSON.stringify(message),
+        signal: AbortSignal.timeout(1000 * REPLY),
       });
       if (again) back();
       if (reply.ok) return;
@@ -46,7 +49,7 @@ async function take(view) {
   if (view.phase === "question" && view.turn !== fetched) {
     try {
       const sheets = await Promise.all([0, 1].map(async (side) => {
-        const reply = await fetch(`clip/${view.turn}/${side}`);
+        const reply = await fetch(`clip/${view.turn}/${side}`, { signal: AbortSignal.timeout(1000 * CLIP) });
         if (!reply.ok) throw new Error(reply.statusText);
         return new Uint8Array(await reply.arrayBuffer());
       }));
@@ -65,7 +68,7 @@ async function take(view) {
   fire("change:view");
 }
 
-let source, lost = null;
+let source, silence, lost = null;
 const over = () => ["finished", "failed"].includes(state.view.phase);
 
 function back() {
@@ -83,16 +86,27 @@ async function missed() {
 
 function listen() {
   source = new EventSource("events");
-  source.onmessage = (event) => take(JSON.parse(event.data));
+  const heard = () => {
+    clearTimeout(silence);
+    silence = setTimeout(source.onerror, 1000 * SILENCE);
+  };
+  source.addEventListener("here", heard);
+  source.onmessage = (event) => {
+    heard();
+    take(JSON.parse(event.data));
+  };
   source.onopen = () => {
+    heard();
     if (lost !== null) back();
   };
   source.onerror = async () => {
+    clearTimeout(silence);
     source.close();
     if (over()) return;
     await missed();
     listen();
   };
+  heard();
 }
 
 front.render({ model, el: document.getElementById("front") });

@@ -28,7 +28,7 @@ from bayespbrl.people.seat import Seat, Stale
 from bayespbrl.people.session import Session, answer_of
 
 LARGEST_BODY = 4096  # bytes
-HEARTBEAT = 10.0  # seconds between signs of life
+HEARTBEAT = 10.0  # seconds between signs of life; host.js misses them after SILENCE
 EVERYWHERE = ("0.0.0.0", "::")  # hosts that stand for all addresses of this machine
 FAREWELL = 1.5  # seconds for the last view to arrive
 KINDS = {"front.js": "text/javascript", "host.js": "text/javascript", "front.css": "text/css"}
@@ -191,7 +191,7 @@ class Page:
             while not self._server.should_exit:
                 changed.clear()
                 view = seat.view
-                yield ": here\n\n" if view is sent else f"data: {json.dumps(view)}\n\n"
+                yield "event: here\ndata: 1\n\n" if view is sent else f"data: {json.dumps(view)}\n\n"
                 sent = view
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(changed.wait(), HEARTBEAT)

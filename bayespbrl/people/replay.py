@@ -11,10 +11,12 @@ from PIL import Image
 
 from bayespbrl import checks
 from bayespbrl.envs.functional import FunctionalEnv
-from bayespbrl.envs.opening import environment_name
+from bayespbrl.envs.opening import environment_name, made_from
 from bayespbrl.learner import Learner
 from bayespbrl.runs.film import rendered_frame, rendering
 from bayespbrl.trajectories import Trajectory
+
+NOT_REPEATED = "reset with the same seed, it does not repeat its episode"
 
 
 def replayed(
@@ -35,7 +37,7 @@ def replayed(
     if "rgb_array" not in (environment.render_mode, *(environment.metadata.get("render_modes") or ())):
         return None
     try:
-        env = rendering(environment)
+        env = rendering(environment, max(len(trajectory), 1))
     except Exception as error:  # whatever an environment of the user's raises: there are plots
         _warn(environment, checks.reason(error))
         return None
@@ -43,7 +45,10 @@ def replayed(
     try:
         for step, same in enumerate(_observed(env, learner.cycle.reset_seed(number), trajectory)):
             if not same:
-                _warn(environment, "reset with the same seed, it does not repeat its episode")
+                spec, limit = made_from(environment), learner.settings.rollouts.max_steps
+                shared = spec is not None and spec.vector_entry_point is not None and limit is None
+                what = "its own vector version, which collects, shares random numbers" if shared else NOT_REPEATED
+                _warn(environment, what)
                 return None
             if step in wanted:
                 pictures.append(Image.fromarray(rendered_frame(env)))
@@ -64,11 +69,11 @@ def _warn(environment: gymnasium.Env, reason: str) -> None:
 
 
 def _observed(env: gymnasium.Env, seed: int, trajectory: Trajectory) -> Iterator[bool]:
-    """For each state of the trajectory whether the environment comes to the same."""
-    space = env.action_space
+    """For each state of the trajectory whether the environment comes to the same, in the type of its space."""
+    space, kind = env.action_space, env.observation_space.dtype
     observation, _ = env.reset(seed=seed)
-    yield np.array_equal(np.asarray(observation), trajectory.states[0])
+    yield np.array_equal(np.asarray(observation).astype(kind), trajectory.states[0])
     for action, state in zip(trajectory.actions, trajectory.states[1:], strict=True):
         taken = action.astype(space.dtype) if isinstance(space, Box) else np.int64(action)
         observation = env.step(taken)[0]
-        yield np.array_equal(np.asarray(observation), state)
+        yield np.array_equal(np.asarray(observation).astype(kind), state)

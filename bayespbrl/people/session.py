@@ -71,6 +71,7 @@ class Session:
         if learner.finished:
             raise ValueError("learner: expected a run with questions left, got a finished run")
         checks.optional(checks.whole, "answers", most_answers)
+        checks.boolean("practice", practice)
         names = [answerer] if answerer is None or isinstance(answerer, str) else list(answerer)
         for name in names:
             checks.optional(checks.short_name, "answerer", name)

@@ -10,6 +10,7 @@ from typing import Any
 import anywidget
 import traitlets
 
+from bayespbrl import checks
 from bayespbrl.learner import Learner
 from bayespbrl.people.session import Session, answer_of
 from bayespbrl.people.views import QUESTION
@@ -39,7 +40,8 @@ class ComparisonWidget(anywidget.AnyWidget):
     whole_page = traitlets.Bool(False).tag(sync=True)
 
     def __init__(self, learner: Learner, **options: Any):
-        """`options` are those of `Session`."""
+        """`options` are those of `Session`, for one person."""
+        checks.optional(checks.short_name, "answerer", options.get("answerer"))
         for earlier in [widget for widget in OPEN if _same_run(widget.session.learner, learner)]:
             earlier.close()
         with ExitStack() as held:  # let go of where anything is refused

@@ -65,8 +65,9 @@ def film_policy(learner: Learner, directory: Path) -> tuple[Path, Path]:
 
 def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
     """Pictures of one episode that the environment renders, and the milliseconds for which to show each."""
-    env, settings = rendering(learner.environment), learner.settings
+    settings = learner.settings
     limit = step_limit(learner.environment, settings.rollouts.max_steps)
+    env = rendering(learner.environment, limit)
     shape, rng = env.observation_space.shape or (), np.random.default_rng(settings.seed)
     actor = Actor(learner.policy, env.action_space, rng, observation_shape=shape)
     stride = 1
@@ -88,8 +89,10 @@ def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
     return np.stack(frames), 1000 * stride / float(env.metadata.get("render_fps") or 10)
 
 
-def rendering(environment: gymnasium.Env) -> gymnasium.Env:
+def rendering(environment: gymnasium.Env, limit: int) -> gymnasium.Env:
     """The environment in a mode that renders: made again where its name says how, else the user's object.
+
+    Copies of what has a name end after `limit` steps, as in the rollouts.
 
     Raises:
       ValueError: it has no mode `rgb_array`, or is an object in another mode.
@@ -104,7 +107,8 @@ def rendering(environment: gymnasium.Env) -> gymnasium.Env:
     modes = environment.metadata.get("render_modes") or ()
     if "rgb_array" not in modes:
         raise ValueError(f"expected a mode rgb_array, got {', '.join(modes) or 'none'}")
-    return flattened(gymnasium.make(spec, render_mode="rgb_array"))
+    own = limit if made_from(environment) is not None else None
+    return flattened(gymnasium.make(spec, max_episode_steps=own, render_mode="rgb_array"))
 
 
 def rendered_frame(env: gymnasium.Env) -> np.ndarray:

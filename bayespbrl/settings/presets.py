@@ -131,7 +131,8 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     name = IDS.get(env, env)
     if checks.one_of("preset", chosen.get("preset", "default"), NAMES) == "paper":
         return {"hyperparameters": "given"} | PAPER.get(name, {})
-    people = chosen.get("expert", "return") not in SIMULATED
+    expert = chosen.get("expert", "return")
+    people = not isinstance(expert, str) or expert not in SIMULATED
     known = TASKS.get(name, {})
     options = DEFAULT | ({} if task is None else task.derived(people=people)) | known
     if task is not None:  # measured only where it matters
