@@ -91,6 +91,23 @@ def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitti
     assert any(ahead)
 
 
+@pytest.mark.filterwarnings("ignore:.*it does not repeat its episode:UserWarning")
+def test_an_environment_that_goes_by_its_earlier_episodes_has_none_but_those_of_the_run(sitting):
+    options = QUICK | {"expert": "other", "same_start": True}
+
+    def learner():
+        return bayespbrl.Learner(gymnasium.wrappers.NormalizeObservation(Camera()), **options)
+
+    def higher(first, second):
+        return "first" if first.states[-1, 0] > second.states[-1, 0] else "second"
+
+    plain = learner().run(higher, answerer="Ada")
+    assert plain.comparable_starts is False
+    session = sitting(learner(), answerer="Ada")
+    answer_all(session, higher)
+    assert fingerprint(session.learner) == fingerprint(plain)
+
+
 def test_a_tie_is_foreseen_last_until_the_run_has_one():
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
     answers = tuple(map(Answer, ("second", "first", "skip", "tie")))

@@ -36,6 +36,9 @@ def replayed(
         return None  # it draws by `draw`, which needs no episode
     if "rgb_array" not in (environment.render_mode, *(environment.metadata.get("render_modes") or ())):
         return None
+    if learner.comparable_starts is False:  # then even to try would change the next episode
+        _warn(environment, NOT_REPEATED)
+        return None
     try:
         env = rendering(environment, max(len(trajectory), 1))
     except Exception as error:  # whatever an environment of the user's raises: there are plots

@@ -224,7 +224,10 @@ class Session:
                     self._failed(moment, error)
 
     def _pending(self) -> Moment | None:
-        return None if self.over else self._foresight.pending()
+        known = self._foresight.present.complete
+        # an environment that goes by its earlier episodes must not have any that the learner does not learn from
+        alone = known and self.learner.comparable_starts is False
+        return None if self.over or alone else self._foresight.pending()
 
     def _keep(self, moment: Moment, entry: Entry | None) -> None:
         moment = self._foresight.current(moment, entry)
