@@ -373,6 +373,32 @@ def test_a_connection_that_dies_without_a_word_is_opened_again(browser, gridworl
         assert answers_of(gridworld) == ["second"]
 
 
+def test_a_window_that_nobody_sees_takes_no_connection(browser, gridworld):
+    """Six are all that a browser has."""
+    hide = """(hidden) => {
+      Object.defineProperty(document, "hidden", { get: () => hidden, configurable: true });
+      document.dispatchEvent(new Event("visibilitychange"));
+    }"""
+    with tab(browser, gridworld) as opened:
+        turn = turn_of(opened)
+        others = [opened.context.new_page() for _ in range(7)]
+        for other in others:
+            other.add_init_script("Object.defineProperty(document, 'hidden', { get: () => true, configurable: true })")
+            other.goto(gridworld.address)
+        assert len(gridworld._server.streams) == 1
+        press(opened, "first")
+        opened.evaluate(hide, True)
+        until(opened, lambda: not gridworld._server.streams)
+        others[0].evaluate(hide, False)
+        others[0].wait_for_selector(f"{READY}[data-turn='{turn + 1}']")
+        press(others[0], "tie")
+        opened.evaluate(hide, False)
+        opened.wait_for_selector(f"{READY}[data-turn='{turn + 2}']")
+        opened.evaluate(hide, False)  # seen all the time
+        assert len(gridworld._server.streams) == 2
+        assert answers_of(gridworld) == ["first", "tie"]
+
+
 @pytest.mark.parametrize("heard", [False, True])
 def test_an_answer_whose_connection_is_lost_is_sent_again_and_counts_once(browser, gridworld, heard):
     """The request is lost, or (`heard`) its reply."""

@@ -85,6 +85,7 @@ async function missed() {
 }
 
 function listen() {
+  if (document.hidden) return;
   source = new EventSource("events");
   const heard = () => {
     clearTimeout(silence);
@@ -104,10 +105,21 @@ function listen() {
     source.close();
     if (over()) return;
     await missed();
-    listen();
+    if (source.readyState === EventSource.CLOSED) listen(); // and has not since the window was seen again
   };
   heard();
 }
+
+// A browser has six connections to a server at most, and each window's events take one: those that nobody sees let go.
+document.addEventListener("visibilitychange", () => {
+  if (document.hidden) {
+    clearTimeout(silence);
+    source?.close();
+  } else if (!over() && source?.readyState !== EventSource.OPEN) {
+    source?.close();
+    listen();
+  }
+});
 
 front.render({ model, el: document.getElementById("front") });
 listen();
