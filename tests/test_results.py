@@ -14,7 +14,15 @@ from test_cli import call, refused
 from test_trials import without_processes
 
 from bayespbrl.diagnostics.report.contents import read_contents
-from bayespbrl.results import calibration_table, kept_table, pairs_table, read_study, values_table, write_results
+from bayespbrl.results import (
+    calibration_table,
+    kept_table,
+    pairs_table,
+    read_study,
+    runs_table,
+    values_table,
+    write_results,
+)
 from bayespbrl.results.intervals import (
     answers_for_good,
     benjamini_hochberg,
@@ -238,6 +246,14 @@ def test_a_trial_whose_first_policy_comes_late_does_not_delay_the_others_of_its_
     (second,) = pairs_table(read_study(made)).to_dict("records")
     for level in ("5", "5 for good"):
         assert (second[f"median to {level}"], second[f"more to {level}"]) == ("2 against 2", "1")
+
+
+def test_chains_that_stand_still_have_no_row_of_digits(made):
+    lines = pd.read_csv(made / "iterations.csv")
+    lines.loc[lines["methods"] == "known", "rhat"] = 1.0234
+    lines.loc[(lines["methods"] == "first") & (lines["seed"] == 2), "rhat"] = 5.6199e15
+    lines.to_csv(made / "iterations.csv", index=False)
+    assert list(runs_table(read_study(made))["worst R̂"]) == ["5.6e+15", "1.002", "1.023"]
 
 
 def test_of_iterations_with_as_many_answers_the_last_policy_counts(made):

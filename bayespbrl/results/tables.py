@@ -24,6 +24,7 @@ REACHED = 0.95  # of the relative value, (value − random policy) / (known rewa
 FAILED_BELOW = 0.5  # of the relative value, where the task declares no `failed_below`
 SURE = 0.95
 CLOSE = 0.03  # of what the best policy of a run gains over the random one
+FAR = 1000.0  # R̂ beyond it is of chains that stand still; no digit of it tells anything
 MISSING = "–"
 
 
@@ -190,7 +191,7 @@ def runs_table(data: StudyData) -> pd.DataFrame:
                 "settings": options or "the default",
                 "fits": MISSING if none else str(len(seen)),
                 "not converged": MISSING if none else str(int((seen["converged"].astype(str) != "True").sum())),
-                "worst R̂": _of(seen["rhat"].max(), "{:.3f}"),
+                "worst R̂": _of(worst := seen["rhat"].max(), "{:.2g}" if worst > FAR else "{:.3f}"),
                 "least ESS": _of(seen["effective_sample_size"].min(), "{:.0f}"),
                 "signal": _of(seen["signal"].median(), "{:.2f}"),
                 "KL": _of(seen["kl"].median(), "{:.3f}"),
