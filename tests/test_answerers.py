@@ -379,13 +379,13 @@ def answered_by_two(tmp_path_factory) -> Path:
     directory = tmp_path_factory.mktemp("people") / "run"
     options = {"preset": "paper", "hyperparameters": "inferred", "max_steps": 20, "evaluation_episodes": 2, "seed": 7}
     run = start("gridworld", directory, **options, expert="other", repeats=0.25, iterations=6, first_queries=9)
-    turn = 0
-    while questions := run.ask():
-        turn += 1
+    turn = 1
+    while questions := run.ask(answerer="Bob" if turn > 7 else "Ada"):
         if turn > 7:  # before the first fit: one program samples all posteriors
             run.tell(["first"], answerer="Bob", seconds=0.2)
         else:
             run.tell([ReturnExpert()(*questions[0].trajectories)], answerer="Ada", seconds=5.0)
+        turn += 1
     return directory
 
 
