@@ -73,10 +73,7 @@ def resume(
       ValueError: a package that may not be imported; an environment with other states or actions than the run's; a
         directory that is no run or cannot be written, or a file in it that is truncated or foreign.
     """
-    log = RunDirectory.open(directory)
-    log.check_learner()
-    if env is None and not import_package:
-        check_permission(log.settings.env, log.path)
+    log = _opened(directory, env, import_package)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
     try:
         log.drop_partial_line()
@@ -100,15 +97,21 @@ def load(
 
     A schedule and a query rule of your own are needed only to continue a run, not to read it.
     """
-    log = RunDirectory.open(directory)
-    log.check_learner()
-    if env is None and not import_package:
-        check_permission(log.settings.env, log.path)
+    log = _opened(directory, env, import_package)
     if log.settings.update.schedule == "other" and schedule is None:
         schedule = ConstantBound()
     if log.settings.questions.query == "other" and query is None:
         query = highest_utility
     return Run(log.path, _restored(log, env, features=features, policy=policy, schedule=schedule, query=query))
+
+
+def _opened(directory: Path | str, env: AnyEnvironment | None, import_package: bool) -> RunDirectory:
+    """The directory of a learner's run whose environment may be opened; `ValueError` for another."""
+    log = RunDirectory.open(directory)
+    log.check_learner()
+    if env is None and not import_package:
+        check_permission(log.settings.env, log.path)
+    return log
 
 
 def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Learner:
