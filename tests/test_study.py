@@ -24,6 +24,7 @@ from bayespbrl.results.study_data import read_study
 from bayespbrl.runs import run as runs
 from bayespbrl.runs.lock import continuing
 from bayespbrl.studies import Study, declared, rows
+from bayespbrl.studies import engine as engine_module
 from bayespbrl.studies.cluster import scheduler_executor
 from bayespbrl.studies.declaration import parsed, shipped
 from bayespbrl.studies.engine import Engine, Progress
@@ -150,6 +151,34 @@ def test_a_trial_that_another_program_runs_is_left_to_it(tmp_path):
         run_trial(row, 2980)
     assert not (row.path(2980) / "events.jsonl").exists()
     assert run_trial(row, 2980)
+
+
+def test_a_trial_that_another_command_runs_is_waited_for_and_no_failure(tmp_path, monkeypatch):
+    seeds = Seeds(row_of("gridworld", tmp_path, TINY, seed=2980), 2)
+    runs.start("gridworld", seeds.row.path(2980), **TINY, seed=2980)
+    held, seen = contextlib.ExitStack(), []
+    held.enter_context(continuing(seeds.row.path(2980)))
+
+    def other_ends(_):
+        held.close()
+
+    monkeypatch.setattr(engine_module.time, "sleep", other_ends)
+    assert Engine([seeds], ThisProcess(), lambda now: seen.append((now.elsewhere, now.failed))).run() == []
+    assert seeds.with_outcome(True) == [2980, 2981]
+    assert (1, 0) in seen
+    assert seen[-1] == (0, 0)
+
+
+@pytest.mark.slow
+def test_two_commands_share_a_study_and_neither_reports_a_failure(tmp_path):
+    (tmp_path / "tiny.toml").write_text(DECLARATION)
+    command = [sys.executable, "-m", "bayespbrl", "study", "tiny.toml", "--trials", "3", "--out", "study"]
+    both = [subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    told = [each.communicate(timeout=300)[0] for each in both]
+    assert [each.returncode for each in both] == [0, 0], told
+    assert not any("Failed" in each for each in told)
+    assert Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "study", trials=3).finished == 9
+    assert len(read_study(tmp_path / "study").rows) == 3
 
 
 def test_a_study_that_was_killed_as_it_began_can_be_begun_again(tmp_path):

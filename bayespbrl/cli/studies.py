@@ -30,7 +30,8 @@ def run_study(study: Study, where: int | Executor, command: str) -> list[Failure
 
         def show(now: Progress) -> None:
             left = "" if now.seconds_left is None else f", about {_time(now.seconds_left)} left"
-            state = f"{now.running} running, {now.failed} failed{left}"
+            elsewhere = f"{now.elsewhere} run by another command, " if now.elsewhere else ""
+            state = f"{now.running} running, {elsewhere}{now.failed} failed{left}"
             bar.update(task, completed=now.done, state=state)
 
         try:

@@ -11,12 +11,17 @@ except ImportError:  # Windows, where the log's own check has to do
     fcntl = None  # type: ignore[assignment]
 
 
+class ContinuedElsewhere(ValueError):
+    """A run that another process continues."""
+
+
 @contextmanager
 def continuing(directory: Path | str) -> Iterator[None]:
     """Lock a run directory. The system releases the lock when the process ends, for whatever reason.
 
     Raises:
-      ValueError: another process continues the run, or the directory is no run.
+      ContinuedElsewhere: another process continues the run.
+      ValueError: the directory is no run.
     """
     try:
         held = os.open(Path(directory) / "settings.json", os.O_RDWR)  # NFS locks only what may be written
@@ -27,7 +32,7 @@ def continuing(directory: Path | str) -> Iterator[None]:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise ValueError(
+                raise ContinuedElsewhere(
                     f"{directory}: expected a run that no other program continues, got one that does; stop it first"
                 ) from error
             except OSError:  # a file system without locks, where the log's own check has to do

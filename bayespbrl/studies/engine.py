@@ -1,7 +1,8 @@
 """The engine of all studies: rows of trials through any `concurrent.futures.Executor`, until each is done or given up.
 
 A trial whose process dies continues from its run directory. A trial that raises is given up at once, since it would
-raise again. Neither ends the others.
+raise again. Neither ends the others. One that another command on the same directory runs is looked at again once
+nothing else is left to do.
 """
 
 import errno
@@ -10,10 +11,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, field
 
+from bayespbrl.runs.lock import ContinuedElsewhere
 from bayespbrl.studies.rows import Row, Seeds, run_trial
 
 MOST_STARTS = 3  # of a trial whose process dies
 POLL = 0.5  # seconds between looks at which trials have started
+ELSEWHERE = 5.0  # seconds between looks at trials that another command runs
 LOST = "the connection to the scheduler is lost"
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -38,7 +41,7 @@ class Progress:
       total: trials of the study, those to come in place of redrawn ones among them.
       before: finished before this call.
       done: finished, `before` among them; redrawn trials do not count.
-      running, failed: trials that run now, or were given up.
+      running, elsewhere, failed: trials that run now, that another command runs, or that were given up.
       seconds: since the call.
       latest: the trial that was finished last: its row and seed.
     """
@@ -47,6 +50,7 @@ class Progress:
     before: int = 0
     done: int = 0
     running: int = 0
+    elsewhere: int = 0
     failed: int = 0
     seconds: float = 0.0
     latest: tuple[Row, int] | None = None
@@ -80,6 +84,7 @@ class Engine:
         self._state = Progress(sum(row.trials for row in self.rows))
         self._starts: dict[tuple[int, int], int] = {}
         self._running: dict[Future[bool], tuple[int, int]] = {}
+        self._elsewhere: set[tuple[int, int]] = set()
         self._submit_all()
         self._state.before = self._done()
         for place, row in enumerate(self.rows):
@@ -94,6 +99,11 @@ class Engine:
                 break
             self._submit_all()
             self._report()
+            if not self._running and self._elsewhere:
+                time.sleep(ELSEWHERE)
+                for each in sorted(self._elsewhere):
+                    self._submit(*each)
+                self._elsewhere.clear()
         return self.failures
 
     def _submit_all(self) -> None:
@@ -123,6 +133,10 @@ class Engine:
         row = self.rows[place]
         try:
             row.outcomes[seed] = future.result()
+        except ContinuedElsewhere:
+            self._elsewhere.add((place, seed))
+            self._starts[place, seed] -= 1
+            return
         except (Exception, CancelledError) as error:
             if _died(error) and self._starts[place, seed] < MOST_STARTS:
                 self._submit(place, seed)
@@ -148,7 +162,7 @@ class Engine:
             return
         state = self._state
         state.done, state.failed = self._done(), len(self.failures)
-        state.running = sum(future.running() for future in self._running)
+        state.running, state.elsewhere = sum(future.running() for future in self._running), len(self._elsewhere)
         state.seconds = time.monotonic() - self._began
         state.latest = None if place is None else (self.rows[place].row, seed)
         self.progress(state)

@@ -10,7 +10,10 @@ from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
+from bayespbrl.runs.lock import ContinuedElsewhere
+
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+SENT = (ValueError, MemoryError, ContinuedElsewhere)  # as they are
 _SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -98,7 +101,7 @@ def _serve(calls: Connection) -> None:
         try:
             outcome: tuple[Any, Exception | None] = (function(*arguments, **named), None)
         except (ValueError, OSError, MemoryError) as error:
-            outcome = None, type(error)(str(error)) if type(error) in (ValueError, MemoryError) else _plain(error)
+            outcome = None, type(error)(str(error)) if type(error) in SENT else _plain(error)
         except Exception as error:  # not every exception can be sent
             outcome = None, RuntimeError(f"{type(error).__name__}: {error}")
         calls.send(outcome)

@@ -171,12 +171,18 @@ def run_trial(row: Row, seed: int) -> bool:
     One that another process has finished in the meantime is left as it is.
 
     Raises:
-      ValueError: another process runs it.
+      ContinuedElsewhere: another process runs it.
+      ValueError: it cannot be run.
     """
     path = row.path(seed)
     if (known := row.outcome(seed)) is not None:
         return known
-    begun = None if path.exists() else runs.start(row.env, path, **row.options, seed=seed)
+    try:
+        begun = None if path.exists() else runs.start(row.env, path, **row.options, seed=seed)
+    except ValueError:
+        if not path.exists():
+            raise
+        begun = None  # another process began it at the same time
     with continuing(path):
         if (known := row.outcome(seed)) is not None:
             return known
