@@ -19,6 +19,7 @@ from bayespbrl.models.likelihoods import ProbitMixture
 
 MAX_SWEEPS = 200  # updates of all factors
 DAMPING = 0.85  # share of each update that is taken, in (0, 1]; reduced whenever the changes grow
+CAUTIOUS = 0.25  # the same, so that the margins of ties do not run far from the prior before it is reduced
 TOLERANCE = 1e-6  # change of the margins' moments, in standard deviations, that counts as none
 # Prior variance of a margin over that of its site, beyond which the site is taken for a runaway. A step has no scale:
 # answers that contradict each other about nearly the same margin each cut a part off whatever the others leave. Their
@@ -190,7 +191,12 @@ class _Factors:
 
 
 def expectation_propagation(
-    loadings: Float[np.ndarray, "k r"], mixture: ProbitMixture, *, prior_scale: float, widening: bool = False
+    loadings: Float[np.ndarray, "k r"],
+    mixture: ProbitMixture,
+    *,
+    prior_scale: float,
+    widening: bool = False,
+    damping: float = DAMPING,
 ) -> GaussianApproximation:
     """Fit the posterior of z ~ N(0, σ²I_r) given answers to the margins t = L z.
 
@@ -201,13 +207,14 @@ def expectation_propagation(
       widening: whether the factor of a violated answer may widen its margin, down to a precision of 0 of all factors
         together. Of many contradicting answers the fit is else too narrow, by a factor of two in the standard
         deviation; of few it may not converge.
+      damping: share of each update that is taken, at first.
     """
     factors, answers = _Factors(loadings, mixture), len(loadings)
     loadings = loadings[factors.first]
     number = len(loadings)
     sites = none = _Sites(np.zeros(number), np.zeros(number))
     gaussian = prior = _moments(loadings, sites, prior_scale)
-    converged, sweeps, last, damping = False, 0, np.inf, DAMPING
+    converged, sweeps, last, first = False, 0, np.inf, damping
     held = np.zeros(number, dtype=bool)
     while sweeps < MAX_SWEEPS and not converged and number:
         sweeps += 1
@@ -215,7 +222,7 @@ def expectation_propagation(
         narrowed = np.where(factors.single, matched.precisions * prior.t_variance, 0.0)  # of several none can run away
         if np.any(narrowed[~held] > RUNAWAY):
             held |= narrowed > 0.01 * RUNAWAY
-            sites, gaussian, damping, last = none, prior, DAMPING, np.inf
+            sites, gaussian, damping, last = none, prior, first, np.inf
             continue
         matched.precisions[held] = matched.shifts[held] = 0.0
         sites = _Sites(*(old + damping * (new - old) for old, new in zip(sites, matched, strict=True)))

@@ -24,7 +24,7 @@ REACHED = 0.95  # of the relative value, (value − random policy) / (known rewa
 FAILED_BELOW = 0.5  # of the relative value, where the task declares no `failed_below`
 SURE = 0.95
 CLOSE = 0.03  # of what the best policy of a run gains over the random one
-FAR = 1000.0  # R̂ beyond it is of chains that stand still; no digit of it tells anything
+FAR = 1000.0  # R̂ beyond it is of what some chain never changes; no digit of it tells anything
 MISSING = "–"
 
 
