@@ -22,7 +22,7 @@ from test_trials import ThisProcess, without_processes
 import bayespbrl
 from bayespbrl.results.study_data import read_study
 from bayespbrl.runs import run as runs
-from bayespbrl.runs.lock import continuing
+from bayespbrl.runs.lock import ContinuedElsewhere, continuing
 from bayespbrl.studies import Study, declared, rows
 from bayespbrl.studies import engine as engine_module
 from bayespbrl.studies.cluster import scheduler_executor
@@ -393,6 +393,8 @@ class Cancels:
         if self._client.status == "closed":
             raise ClosedClientError("Client is closed.")
         future = Future()
+        if seed == 4:
+            future.set_exception(ContinuedElsewhere("another command runs it"))
         if seed == 6:
             self._client.status = "closed"
             future.cancel()
@@ -400,11 +402,11 @@ class Cancels:
         return future
 
 
-def test_trials_whose_scheduler_is_lost_are_given_up_whether_cancelled_or_pending(tmp_path):
-    seeds = Seeds(row_of("gridworld", tmp_path / "row", TINY, seed=5, name="row"), 3)
+def test_trials_whose_scheduler_is_lost_are_given_up_whether_cancelled_pending_or_run_elsewhere(tmp_path):
+    seeds = Seeds(row_of("gridworld", tmp_path / "row", TINY, seed=4, name="row"), 4)
     failures = Engine([seeds], Cancels()).run()
     lost = "the connection to the scheduler is lost"
-    assert sorted(map(str, failures)) == [f"row seed {seed}: {lost}" for seed in (5, 6, 7)]
+    assert sorted(map(str, failures)) == [f"row seed {seed}: {lost}" for seed in (4, 5, 6, 7)]
 
 
 def test_the_time_left_follows_the_pace_of_this_call():

@@ -158,7 +158,7 @@ def posterior_draws(
             # setting. Fitted cautiously, at the means of all these draws, they let it pass.
             again = _with_better_references(chains, fits, model, answers, number, damping=CAUTIOUS)
             again, more, second = _until_converged(again.extended(sampler.num_warmup), fits, sampler)
-            if second.rhat_max < report.rhat_max:
+            if second.converged() or second.rhat_max < report.rhat_max:
                 chains, wanted, report = again, more, second
         evidence = log_evidence(chains, wanted, seed=seed)
     attributes = fit_attributes(number, seed, evidence)

@@ -151,7 +151,8 @@ class Engine:
 
     def _give_up(self) -> None:
         """All trials whose end nobody will tell; they may be continued."""
-        self.failures += [Failure(self.rows[place].row, seed, LOST) for place, seed in self._running.values()]
+        lost = [*self._running.values(), *sorted(self._elsewhere)]
+        self.failures += [Failure(self.rows[place].row, seed, LOST) for place, seed in lost]
         self._running.clear()
 
     def _done(self) -> int:
