@@ -162,18 +162,18 @@ def test_ties_closer_than_expected_leave_chains_free_to_move_between_settings():
     assert np.mean(np.diff(settings) != 0) > 0.4 * (1 - np.sum(shares**2))  # of what independent draws would do
 
 
-def test_a_chain_held_in_one_setting_by_ties_is_begun_again_with_references_that_let_it_pass():
+@pytest.mark.parametrize("seed", [1, 5, 643389271])
+def test_chains_held_in_one_setting_by_ties_begin_again_and_converge(seed):
     """Of an InvertedPendulum run: 27 settings, ten ordered answers, nine ties; the threshold is 0.003, one margin 5.
 
-    The first references of one setting are at a margin of 18 instead of 9. With this seed a chain begins there and
-    never leaves: R̂ is 21 after 500 draws. The file has the lower triangles of the differences.
+    The first references of one setting are at a margin of 18 instead of 9. Without a second beginning 500 draws do not
+    converge with these seeds; with seed 5 a chain never leaves the setting where it began, and R̂ is 21 (another
+    processor or other libraries draw otherwise). The file has the lower triangles of the differences.
     """
     differences = np.load(Path(__file__).parent / "data" / "ties_of_inverted_pendulum.npy").astype(float)
     tied = np.arange(differences.shape[1]) >= 10
-    tree = sample_posterior(differences, **INFERRED, indifferent=tied, max_samples=500, seed=5)
+    tree = sample_posterior(differences, **INFERRED, indifferent=tied, max_samples=500, seed=seed)
     assert tree.attrs["converged"] == 1
-    settings = tree["posterior"]["setting"].values
-    assert np.all(np.mean(settings == 24, axis=1) > 0.05)  # each chain was there, and left
 
 
 def test_ties_that_contradict_each_other_are_lapses_and_the_chains_converge():
