@@ -19,7 +19,6 @@ from bayespbrl.models.likelihoods import ProbitMixture
 
 MAX_SWEEPS = 200  # updates of all factors
 DAMPING = 0.85  # share of each update that is taken, in (0, 1]; reduced whenever the changes grow
-CAUTIOUS = 0.25  # the same, so that the margins of ties do not run far from the prior before it is reduced
 TOLERANCE = 1e-6  # change of the margins' moments, in standard deviations, that counts as none
 # Prior variance of a margin over that of its site, beyond which the site is taken for a runaway. A step has no scale:
 # answers that contradict each other about nearly the same margin each cut a part off whatever the others leave. Their

@@ -13,7 +13,7 @@ from bayespbrl import checks
 from bayespbrl.models.chains import CHUNK, LEAST_LAPSES, Chains
 from bayespbrl.models.convergence import Convergence, chain_convergence
 from bayespbrl.models.evidence import log_evidence
-from bayespbrl.models.expectation_propagation import CAUTIOUS, DAMPING
+from bayespbrl.models.expectation_propagation import DAMPING
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, refitted
 from bayespbrl.models.likelihoods import has_steps, ties_of
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
@@ -22,6 +22,9 @@ from bayespbrl.models.threads import one_blas_thread
 
 # A setting that fewer draws have is not diagnosed: how many do is known too badly, and matters little.
 LEAST_SHARE = 0.05
+# The damping of references that are fitted once more: the margins of ties do not run far from the posterior before
+# expectation propagation reduces it.
+CAUTIOUS = 0.25
 
 
 @dataclass(frozen=True)
