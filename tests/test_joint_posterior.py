@@ -162,18 +162,20 @@ def test_ties_closer_than_expected_leave_chains_free_to_move_between_settings():
     assert np.mean(np.diff(settings) != 0) > 0.4 * (1 - np.sum(shares**2))  # of what independent draws would do
 
 
-@pytest.mark.parametrize("seed", [1, 5, 643389271])
-def test_chains_held_in_one_setting_by_ties_begin_again_and_converge(seed):
-    """Of an InvertedPendulum run: 27 settings, ten ordered answers, nine ties; the threshold is 0.003, one margin 5.
+@pytest.mark.parametrize("seed", [5, 12, 643389271])
+def test_first_draws_of_a_large_threshold_hide_no_setting(seed):
+    """Of an InvertedPendulum run: 27 settings, ten ordered answers, nine ties; the threshold is 0.003.
 
-    The first references of one setting are at a margin of 18 instead of 9. Without a second beginning 500 draws do not
-    converge with these seeds; with seed 5 a chain never leaves the setting where it began, and R̂ is 21 (another
-    processor or other libraries draw otherwise). The file has the lower triangles of the differences.
+    Each of these seeds has a chain that starts at a threshold of 1. References fitted at the mean of the warm-up's
+    draws, 0.013 to 0.017, are far from the posterior: with seed 12 the chains take eight times as long, with the others
+    they converge without the 25th setting. By the evidence of each setting alone it has 0.14 of the posterior. The file
+    has the lower triangles of the differences.
     """
     differences = np.load(Path(__file__).parent / "data" / "ties_of_inverted_pendulum.npy").astype(float)
     tied = np.arange(differences.shape[1]) >= 10
     tree = sample_posterior(differences, **INFERRED, indifferent=tied, max_samples=500, seed=seed)
     assert tree.attrs["converged"] == 1
+    assert 0.07 < np.mean(tree["posterior"]["setting"].values == 24) < 0.21
 
 
 def test_ties_that_contradict_each_other_are_lapses_and_the_chains_converge():

@@ -145,10 +145,13 @@ class Chains:
             powers.append(float(np.clip(rank * len(away) / max(squares, 1e-9), LEAST_POWER, 1.0)))
         return powers
 
-    def means(self) -> dict[str, float]:
-        """Mean over all draws of steepness, lapse rate and tie threshold."""
-        names = ("steepness", "lapse_rate", "tie_threshold")
-        return {name: float(np.mean(self.values(name, self.length))) for name in names}
+    def typical(self) -> dict[str, float]:
+        """Mean over all draws of steepness and lapse rate, median of the tie threshold.
+
+        A threshold may be a thousandth of where chains start: one first draw among many would make the mean.
+        """
+        draws = {name: self.values(name, self.length) for name in ("steepness", "lapse_rate", "tie_threshold")}
+        return {name: float((np.median if name == "tie_threshold" else np.mean)(them)) for name, them in draws.items()}
 
     @property
     def length(self) -> int:

@@ -195,7 +195,6 @@ def expectation_propagation(
     *,
     prior_scale: float,
     widening: bool = False,
-    damping: float = DAMPING,
 ) -> GaussianApproximation:
     """Fit the posterior of z ~ N(0, σ²I_r) given answers to the margins t = L z.
 
@@ -206,14 +205,13 @@ def expectation_propagation(
       widening: whether the factor of a violated answer may widen its margin, down to a precision of 0 of all factors
         together. Of many contradicting answers the fit is else too narrow, by a factor of two in the standard
         deviation; of few it may not converge.
-      damping: share of each update that is taken, at first.
     """
     factors, answers = _Factors(loadings, mixture), len(loadings)
     loadings = loadings[factors.first]
     number = len(loadings)
     sites = none = _Sites(np.zeros(number), np.zeros(number))
     gaussian = prior = _moments(loadings, sites, prior_scale)
-    converged, sweeps, last, first = False, 0, np.inf, damping
+    converged, sweeps, last, damping = False, 0, np.inf, DAMPING
     held = np.zeros(number, dtype=bool)
     while sweeps < MAX_SWEEPS and not converged and number:
         sweeps += 1
@@ -221,7 +219,7 @@ def expectation_propagation(
         narrowed = np.where(factors.single, matched.precisions * prior.t_variance, 0.0)  # of several none can run away
         if np.any(narrowed[~held] > RUNAWAY):
             held |= narrowed > 0.01 * RUNAWAY
-            sites, gaussian, damping, last = none, prior, first, np.inf
+            sites, gaussian, damping, last = none, prior, DAMPING, np.inf
             continue
         matched.precisions[held] = matched.shifts[held] = 0.0
         sites = _Sites(*(old + damping * (new - old) for old, new in zip(sites, matched, strict=True)))

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from bayespbrl import checks
-from bayespbrl.models.expectation_propagation import DAMPING, GaussianApproximation, expectation_propagation
+from bayespbrl.models.expectation_propagation import GaussianApproximation, expectation_propagation
 from bayespbrl.models.likelihoods import Likelihood, WithLapses, has_steps, prob, ties_of
 from bayespbrl.models.low_rank import LowRank, low_rank, used_rows
 from bayespbrl.models.preference_model import PreferenceModel
@@ -70,13 +70,7 @@ def fit_gaussian(
 
 
 def refitted(
-    fit: GaussianFit,
-    model: PreferenceModel,
-    number_of_preferences: int,
-    tied: ArrayLike | None,
-    *,
-    widening: bool,
-    damping: float = DAMPING,
+    fit: GaussianFit, model: PreferenceModel, number_of_preferences: int, tied: ArrayLike | None, *, widening: bool
 ) -> GaussianFit:
     """The same factorisation and likelihood with the Gaussian of another model, in which nothing is left to infer.
 
@@ -89,7 +83,7 @@ def refitted(
             with suppress(np.linalg.LinAlgError):  # wider than the prior allows
                 approximation = _approximation(fit.factors, likelihood, model.prior_scale, widening=True)
         if approximation is None or not approximation.converged:
-            approximation = _approximation(fit.factors, likelihood, model.prior_scale, damping=damping)
+            approximation = _approximation(fit.factors, likelihood, model.prior_scale)
         return replace(fit, approximation=approximation)
 
 
@@ -107,12 +101,7 @@ def _which_tied(tied: ArrayLike | None, model: PreferenceModel, number: int) -> 
 
 
 def _approximation(
-    factors: LowRank,
-    likelihood: Likelihood,
-    prior_scale: float,
-    *,
-    widening: bool = False,
-    damping: float = DAMPING,
+    factors: LowRank, likelihood: Likelihood, prior_scale: float, *, widening: bool = False
 ) -> GaussianApproximation:
     """Expectation propagation's Gaussian.
 
@@ -125,7 +114,7 @@ def _approximation(
 
     def fitted(answers: Likelihood) -> GaussianApproximation:
         mixture = answers.probit_mixture().of(used)
-        return expectation_propagation(loadings, mixture, prior_scale=prior_scale, widening=widening, damping=damping)
+        return expectation_propagation(loadings, mixture, prior_scale=prior_scale, widening=widening)
 
     fit = fitted(likelihood)
     if isinstance(likelihood, WithLapses) or not has_steps(likelihood):

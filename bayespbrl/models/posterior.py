@@ -13,7 +13,6 @@ from bayespbrl import checks
 from bayespbrl.models.chains import CHUNK, LEAST_LAPSES, Chains
 from bayespbrl.models.convergence import Convergence, chain_convergence
 from bayespbrl.models.evidence import log_evidence
-from bayespbrl.models.expectation_propagation import DAMPING
 from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, refitted
 from bayespbrl.models.likelihoods import has_steps, ties_of
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
@@ -22,9 +21,6 @@ from bayespbrl.models.threads import one_blas_thread
 
 # A setting that fewer draws have is not diagnosed: how many do is known too badly, and matters little.
 LEAST_SHARE = 0.05
-# The damping of references that are fitted once more: the margins of ties do not run far from the posterior before
-# expectation propagation reduces it.
-CAUTIOUS = 0.25
 
 
 @dataclass(frozen=True)
@@ -87,8 +83,7 @@ def sample_posterior(
       num_warmup: draws a chain that are discarded (burn-in); rounded up to whole chunks of min(num_samples, 25) draws,
         and once more as many where the references of the chains are fitted anew after it.
       num_samples: draws a chain to begin with, >= 4.
-      max_samples: cap on the draws a chain. Where few answers have ties and the cap is reached, the references are
-        fitted once more and the chains begin again, at most as long.
+      max_samples: cap on the draws a chain.
       num_chains: >= 2, so that R̂ means something.
       seed: the same seed gives the same draws.
 
@@ -152,17 +147,9 @@ def posterior_draws(
             by_answerer=answers.by_answerer(settings.shape[1]),
         )
         chains = chains.extended(sampler.num_warmup)
-        refit = bool(chains.draws) and _needs_better_references(chains, fits[0], model)
-        if refit:
+        if chains.draws and _needs_better_references(chains, fits[0], model):
             chains = _with_better_references(chains, fits, model, answers, number).extended(sampler.num_warmup)
         chains, wanted, report = _until_converged(chains, fits, sampler)
-        if refit and not chains.many and not report.converged():
-            # Decision: Gaussians of ties within a tiny threshold may be far from the posterior, and hold a chain in one
-            # setting. Fitted cautiously, at the means of all these draws, they let it pass.
-            again = _with_better_references(chains, fits, model, answers, number, damping=CAUTIOUS)
-            again, more, second = _until_converged(again.extended(sampler.num_warmup), fits, sampler)
-            if second.converged() or second.rhat_max < report.rhat_max:
-                chains, wanted, report = again, more, second
         evidence = log_evidence(chains, wanted, seed=seed)
     attributes = fit_attributes(number, seed, evidence)
     return posterior_tree(fits, chains, wanted, report, attributes, np.asarray(differences), answers)
@@ -193,21 +180,16 @@ def _needs_better_references(chains: Chains, fit: GaussianFit, model: Preference
 
 
 def _with_better_references(
-    chains: Chains,
-    fits: Sequence[GaussianFit],
-    model: PreferenceModel,
-    answers: Answers,
-    number: int,
-    damping: float = DAMPING,
+    chains: Chains, fits: Sequence[GaussianFit], model: PreferenceModel, answers: Answers, number: int
 ) -> Chains:
-    """The chains with references fitted at the means of their draws so far."""
-    means = chains.means()
-    steepness = means["steepness"] if model.steepness is None else model.steepness
-    lapse_rate = max(means["lapse_rate"], LEAST_LAPSES) if model.lapse_rate is None else model.lapse_rate
-    threshold = means["tie_threshold"] if answers.indifferent is not None else model.tie_threshold
+    """The chains with references fitted at what is typical of their draws so far."""
+    typical = chains.typical()
+    steepness = typical["steepness"] if model.steepness is None else model.steepness
+    lapse_rate = max(typical["lapse_rate"], LEAST_LAPSES) if model.lapse_rate is None else model.lapse_rate
+    threshold = typical["tie_threshold"] if answers.indifferent is not None else model.tie_threshold
     given = replace(model, steepness=steepness, lapse_rate=lapse_rate, tie_threshold=threshold)
-    them = [refitted(fit, given, number, answers.indifferent, widening=chains.many, damping=damping) for fit in fits]
-    return chains.with_references(them, means)
+    them = [refitted(fit, given, number, answers.indifferent, widening=chains.many) for fit in fits]
+    return chains.with_references(them, typical)
 
 
 def _diagnosed(
