@@ -229,7 +229,7 @@ def test_a_policy_without_a_mode_is_tried_and_kept_with_its_noise():
     learner = Learner(Slope(), policy=Plain(), answers=2, restart_iterations=1, **FAST).run(ReturnExpert())
     assert learner.iterations[-1]["kept"] > 0
     assert isinstance(learner.policy, Plain)
-    actor = Actor(learner.policy, Slope.action_space, np.random.default_rng(0), observation_shape=(2,))
+    actor = Actor(learner.policy, Slope.observation_space, Slope.action_space, np.random.default_rng(0))
     assert actor.act(np.zeros(2)) != actor.act(np.zeros(2))
     with pytest.raises(ValueError, match="observation: expected finite entries, got NaN or infinity"):
         actor.act(np.array([0, np.nan]))

@@ -1,6 +1,5 @@
 """A policy acting in an environment: one observation in, one action out."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ from gymnasium.spaces import Box
 from jaxtyping import Array, Key
 
 from bayespbrl import checks
+from bayespbrl.envs.spaces import from_plain, given_to_plain, plain_space, unbatched
 from bayespbrl.policies.batch import sample_actions
 from bayespbrl.policies.greedy import Greedy, greedy
 from bayespbrl.policies.policy import Sampler, is_discrete
@@ -18,25 +18,18 @@ from bayespbrl.policies.policy import Sampler, is_discrete
 
 @dataclass(frozen=True)
 class Actor:
-    """A policy and the action space whose bounds its actions keep.
+    """A policy in an environment.
 
     Attributes:
-      policy: π(a|s).
-      action_space: of the policy's actions.
+      policy: π(a|s), of plain observations and actions (`plain_space`).
+      observation_space, action_space: of the environment.
       rng: where a call without a key draws from.
-      observe: from an observation of the environment to one of the policy's.
-      enact: from an action of the policy's to one of the environment.
-      observation_shape: of one observation of the environment; None where it has parts, as those of a `Dict` space.
-      unbatched: from a batch of observations with parts to a list of them; None where it is given one.
     """
 
     policy: Sampler
+    observation_space: Space[Any]
     action_space: Space[Any]
     rng: np.random.Generator
-    observe: Callable[[Any], Any] = np.asarray
-    enact: Callable[[Any], Any] = np.asarray
-    observation_shape: tuple[int, ...] | None = ()
-    unbatched: Callable[[Any], list[Any] | None] | None = None
 
     def act(self, observation: Any, *, key: Key[Array, ""] | None = None) -> Any:
         """An action a ~ π(·|observation), clipped to the action space; an int where actions are discrete.
@@ -44,7 +37,7 @@ class Actor:
         Raises:
           ValueError: an observation of another shape.
         """
-        expected = self.observation_shape
+        expected = self.observation_space.shape
         if expected is not None and (shape := np.asarray(observation).shape) != expected:
             raise ValueError(f"observation: expected shape {expected}, got {shape}")
         return self._drawn(self.policy, [observation], key)[0]
@@ -64,9 +57,9 @@ class Actor:
         Raises:
           ValueError: observations of another shape; a policy of the user's that has neither `mode` nor `probabilities`.
         """
-        shape = self.observation_shape
+        shape = self.observation_space.shape
         if shape is None:
-            batch = None if self.unbatched is None else self.unbatched(observation)
+            batch = unbatched(self.observation_space, observation)
         elif (observed := np.asarray(observation)).shape == shape:
             batch = None
         elif observed.shape[1:] == shape:
@@ -87,17 +80,18 @@ class Actor:
                 f"deterministic: expected a policy with a method mode or probabilities, got {type(policy).__name__}"
             )
         best = np.argmax(policy.probabilities(self._rows(observations)), axis=1)
-        return [int(self.enact(int(action))) for action in best]
+        return [int(from_plain(self.action_space, int(action))) for action in best]
 
     def _rows(self, observations: Any) -> np.ndarray:
-        rows = np.array([self.observe(each) for each in observations])
+        rows = np.array([given_to_plain(self.observation_space, each, self.action_space) for each in observations])
         checks.finite("observation", rows)
         return rows.astype(np.int64 if rows.ndim == 1 else np.float64)
 
     def _drawn(self, policy: Sampler, observations: Any, key: Key[Array, ""] | None = None) -> list[Any]:
         if key is None:
             key = jax.random.key(int(self.rng.integers(2**31)))
-        actions, space = sample_actions(policy, key, self._rows(observations)), self.action_space
+        actions, space = sample_actions(policy, key, self._rows(observations)), plain_space(self.action_space)
         if not isinstance(space, Box):
-            return [int(self.enact(action)) for action in actions]
-        return [self.enact(np.clip(action, space.low, space.high).astype(space.dtype)) for action in actions]
+            return [int(from_plain(self.action_space, action)) for action in actions]
+        clipped = [np.clip(action, space.low, space.high).astype(space.dtype) for action in actions]
+        return [from_plain(self.action_space, action) for action in clipped]

@@ -68,8 +68,7 @@ def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
     settings = learner.settings
     limit = step_limit(learner.environment, settings.rollouts.max_steps)
     env = rendering(learner.environment, limit)
-    shape, rng = env.observation_space.shape or (), np.random.default_rng(settings.seed)
-    actor = Actor(learner.policy, env.action_space, rng, observation_shape=shape)
+    actor = Actor(learner.policy, env.observation_space, env.action_space, np.random.default_rng(settings.seed))
     stride = 1
     try:
         observation, _ = env.reset(seed=settings.seed)

@@ -1,7 +1,6 @@
 """A run on disk: start it, resume it, load it."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import xarray as xr
 
 from bayespbrl import checks, rollouts
 from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, made_again
-from bayespbrl.envs.spaces import check_of_space, from_plain, given_to_plain, unbatched
+from bayespbrl.envs.spaces import check_of_space
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
@@ -180,16 +179,8 @@ class Run:
         return self._actor(self.learner.last_policy)
 
     def _actor(self, policy: Sampler) -> Actor:
-        environment, given = self.learner.environment, self.learner.given
-        return Actor(
-            policy,
-            environment.action_space,
-            np.random.default_rng(),
-            observe=partial(given_to_plain, given.observation_space, actions=given.action_space),
-            enact=partial(from_plain, given.action_space),
-            observation_shape=given.observation_space.shape,
-            unbatched=partial(unbatched, given.observation_space),
-        )
+        given = self.learner.given
+        return Actor(policy, given.observation_space, given.action_space, np.random.default_rng())
 
     @property
     def preferences(self) -> Preferences:
