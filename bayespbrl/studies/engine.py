@@ -7,6 +7,7 @@ nothing else is left to do.
 
 import errno
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from dataclasses import dataclass, field
 from bayespbrl.runs.lock import ContinuedElsewhere
 from bayespbrl.studies.rows import Row, Seeds, run_trial
 
-MOST_STARTS = 3  # of a trial whose process dies
+MOST_DEATHS = 3  # of a trial's process
 POLL = 0.5  # seconds between looks at which trials have started
 ELSEWHERE = 5.0  # seconds between looks at trials that another command runs
 LOST = "the connection to the scheduler is lost"
@@ -82,7 +83,8 @@ class Engine:
         """All trials, and those that replace redrawn ones; returns the failures."""
         self._began = time.monotonic()
         self._state = Progress(sum(row.trials for row in self.rows))
-        self._starts: dict[tuple[int, int], int] = {}
+        self._submitted: set[tuple[int, int]] = set()
+        self._deaths: Counter[tuple[int, int]] = Counter()
         self._running: dict[Future[bool], tuple[int, int]] = {}
         self._elsewhere: set[tuple[int, int]] = set()
         self._submit_all()
@@ -115,11 +117,11 @@ class Engine:
         given_up += [Failure(row.row, *damage) for row in self.rows for damage in row.damaged.items()]
         self.failures += [failure for failure in given_up if failure not in self.failures]
         for _, place, seed in sorted(new):
-            if (place, seed) not in self._starts:
+            if (place, seed) not in self._submitted:
                 self._submit(place, seed)
 
     def _submit(self, place: int, seed: int) -> None:
-        self._starts[place, seed] = self._starts.get((place, seed), 0) + 1
+        self._submitted.add((place, seed))
         try:
             self._running[self.executor.submit(run_trial, self.rows[place].row, seed)] = (place, seed)
         except Exception as error:
@@ -135,13 +137,15 @@ class Engine:
             row.outcomes[seed] = future.result()
         except ContinuedElsewhere:
             self._elsewhere.add((place, seed))
-            self._starts[place, seed] -= 1
             return
         except (Exception, CancelledError) as error:
-            if _died(error) and self._starts[place, seed] < MOST_STARTS:
-                self._submit(place, seed)
-                return
-            reason = f"died {self._starts[place, seed]} times: {error}" if _died(error) else str(error)
+            reason = str(error)
+            if _died(error):
+                self._deaths[place, seed] += 1
+                if self._deaths[place, seed] < MOST_DEATHS:
+                    self._submit(place, seed)
+                    return
+                reason = f"died {MOST_DEATHS} times: {error}"
             self.failures.append(Failure(row.row, seed, reason))
             if getattr(error, "errno", None) in NO_SPACE:
                 raise ValueError(f"the disk is full: {error}") from error
