@@ -29,12 +29,12 @@ from bayespbrl.runs.directory import read_summary
 
 
 def run_directories(study: Path) -> list[Path]:
-    """The run directory itself, or those in it."""
+    """The run directory itself, or those in it, however deep."""
     if (study / "settings.json").exists():
         return [study]
-    runs = sorted(path.parent for path in study.glob("*/summary.json"))
+    runs = sorted(path.parent for path in study.rglob("summary.json"))
     if not runs:
-        raise ValueError(f"{study}: expected a run directory or a folder of them with a finished iteration, got none")
+        raise ValueError(f"{study}: expected a run directory or a folder with a finished iteration, got none")
     return runs
 
 
