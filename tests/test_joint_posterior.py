@@ -202,6 +202,20 @@ def test_a_side_bias_and_two_answerers_agree_with_quadrature():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("settings", [1, 2])
+def test_two_answerers_who_contradict_each_other_agree_with_quadrature(settings):
+    """Either may be the one who errs: a quarter of the posterior follows the one who gave an answer less."""
+    sizes = np.abs(np.random.default_rng(0).normal(size=(11, 1))) + 0.3
+    signs, answerers = np.repeat([1.0, -1.0], [6, 5])[:, None], np.repeat([0, 1], [6, 5])
+    rows = np.stack([sizes * signs, 1.4 * sizes[::-1] * signs])[:settings]
+    expected, _ = quadrature(rows, answerers=answerers)
+    for seed in range(3):
+        tree = sample_posterior(rows, **INFERRED, answerers=answerers, num_samples=2000, seed=seed)
+        assert tree.attrs["converged"] == 1
+        agree(tree, expected)
+
+
+@pytest.mark.slow
 def test_each_of_two_answerers_has_a_lapse_rate_and_a_side_bias_as_by_quadrature():
     rows, sides, who = SETTINGS[0, :, 0], np.array([1, -1, 1, 1]), np.array([0, 1, 1, 0])
     tree = sample_posterior(

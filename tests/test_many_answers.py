@@ -166,6 +166,23 @@ def test_the_gaussian_of_many_contradicting_answers_is_as_wide_as_their_posterio
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 7])
+def test_a_setting_without_draws_in_the_burn_in_is_visited_later(seed):
+    """Eight settings, each with 0.06 to 0.19 of the posterior by the evidence of each alone.
+
+    With a reference of its own width, a setting that the burn-in did not visit never was: with these seeds one or two.
+    """
+    rng = np.random.default_rng(0)
+    weights, base = rng.normal(size=24), rng.normal(size=(150, 24))
+    settings = np.stack([base + 0.04 * rng.normal(size=base.shape) for _ in range(8)]) / np.sqrt(24)
+    settings *= np.sign(base @ weights)[:, None]  # no wrong answers
+    tree = sample_posterior(settings, steepness=None, lapse_rate=None, max_samples=1000, seed=seed)
+    assert tree.attrs["rhat_max"] < 1.05
+    shares = np.bincount(tree["posterior/setting"].values.ravel(), minlength=8) / tree["posterior/setting"].size
+    assert np.min(shares) > 0.02
+
+
+@pytest.mark.slow
 def test_a_threshold_may_be_given_where_nobody_was_undecided_and_k_is_another():
     few = {"num_samples": 25, "max_samples": 25}
     tree = sample_posterior(answers(70, seed=3), tie_threshold=0.1, number_of_preferences=80, **few)

@@ -126,24 +126,28 @@ class Chains:
     def with_references(self, fits: Sequence[GaussianFit], values: Mapping[str, float]) -> "Chains":
         """The same chains with the references of other fits, which were made at these values of the unknowns."""
         rank = max(fit.factors.loadings.shape[1] for fit in fits)
-        powers = self._powers(fits) if self.many else [REFERENCE_POWER] * len(fits)
-        settings = stacked([_with_reference(fit, rank, power) for fit, power in zip(fits, powers, strict=True)])
+        power = self._power(fits) if self.many else REFERENCE_POWER
+        settings = stacked([_with_reference(fit, rank, power) for fit in fits])
         fitted = None if self.problem.fitted_steepness is None else values["steepness"]
         return replace(self, problem=self.problem._replace(settings=settings, fitted_steepness=fitted))
 
-    def _powers(self, fits: Sequence[GaussianFit]) -> list[float]:
-        """The power of each fit's Gaussian factors at which it is as wide as the last half of many answers' draws."""
+    def _power(self, fits: Sequence[GaussianFit]) -> float:
+        """The power of the Gaussian factors at which references are as wide as the last half of many answers' draws.
+
+        Decision: one for all settings. That of a setting without draws would be anybody's guess, and a reference of
+        another width than its neighbours' is never entered.
+        """
         half = self.length // 2
         z, setting = (self.collected(name, self.length)[:, half:] for name in ("coordinates", "setting"))
-        powers = []
+        dimensions = squares = 0.0
         for number, fit in enumerate(fits):
             rank, site_precisions = fit.factors.loadings.shape[1], np.zeros(len(fit.differences))
             away = z[setting == number][:, :rank] - fit.approximation.mean
             site_precisions[used_rows(fit.factors.loadings)] = fit.approximation.site_precisions
             margins = away @ fit.factors.loadings.T
-            squares = np.sum(away**2) / fit.model.prior_scale**2 + np.sum(site_precisions * margins**2)
-            powers.append(float(np.clip(rank * len(away) / max(squares, 1e-9), LEAST_POWER, 1.0)))
-        return powers
+            squares += np.sum(away**2) / fit.model.prior_scale**2 + np.sum(site_precisions * margins**2)
+            dimensions += rank * len(away)
+        return float(np.clip(dimensions / max(squares, 1e-9), LEAST_POWER, 1.0))
 
     def typical(self) -> dict[str, float]:
         """Mean over all draws of steepness and lapse rate, median of the tie threshold.

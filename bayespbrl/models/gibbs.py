@@ -5,6 +5,9 @@ conditional distribution. The setting (length scales) is drawn given the *whiten
 Gaussian reference (m, A) of each setting: ξ means nearly the same under every setting, so that the move goes far. As
 the weights change with it, its probabilities carry the volume |A| (reversible jump with a deterministic map; Green
 1995). Between these moves the weights are sampled by elliptical slices.
+
+Where several people answer and contradict each other, one of them errs, and weights that follow another one need other
+lapse rates. Then the setting is drawn with the lapse rates summed out, and the weights and their mirror image too.
 """
 
 from collections.abc import Sequence
@@ -15,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
+from jax.scipy.special import logsumexp
 from jaxtyping import Float, Int, PRNGKeyArray, Shaped
 
 from bayespbrl.models.likelihoods import (
@@ -137,6 +141,9 @@ def moved(
 ) -> tuple[Float[Array, " q"], Unknowns]:
     """New weights and unknowns after one move of each kind; fixed parameters have no move."""
     # never `fold_in` beside `split`: its keys are the same, and moves that share a key share their random numbers
+    if _several_err(problem):
+        key, key_mirror = random.split(key)
+        z, unknowns = _mirror_move(key_mirror, z, unknowns, problem)
     key_setting, *keys, key_steepness, key_threshold = random.split(key, 6)
     if len(problem.log_probabilities) > 1:
         z, unknowns = _setting_move(key_setting, z, unknowns, problem)
@@ -166,11 +173,48 @@ def _setting_move(
     whitened = settings.inverse_root[now] @ (z - settings.centre[now])
     points = settings.centre + settings.root @ whitened
     margins = jnp.einsum("skq,sq->sk", settings.loadings, points)
-    log_p = log_likelihood(problem, unknowns, margins)
-    log_p -= 0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # eq. 7: log N(z; 0, σ²I)
-    log_p += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A| (Green 1995)
-    setting = random.categorical(key, log_p + problem.log_probabilities)
+    log_prior = -0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # eq. 7: log N(z; 0, σ²I)
+    log_prior += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A| (Green 1995)
+    if _several_err(problem):
+        setting, unknowns = _chosen_with_lapses(key, log_prior + problem.log_probabilities, margins, unknowns, problem)
+    else:
+        log_p = log_likelihood(problem, unknowns, margins) + log_prior
+        setting = random.categorical(key, log_p + problem.log_probabilities)
     return points[setting], unknowns._replace(setting=setting)
+
+
+def _mirror_move(
+    key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem
+) -> tuple[Float[Array, " q"], Unknowns]:
+    """The weights or their mirror image −z, equally probable a priori, and lapse rates.
+
+    Of two people who contradict each other either may be the one who errs: one who has the buttons the wrong way round,
+    say. No ellipse passes between the two parts of the posterior, because between them both err.
+    """
+    points = jnp.stack([z, -z])
+    margins = points @ at_setting(problem.settings.loadings, unknowns.setting).T
+    chosen, unknowns = _chosen_with_lapses(key, jnp.zeros(2), margins, unknowns, problem)
+    return points[chosen], unknowns
+
+
+def _several_err(problem: JointProblem) -> bool:
+    """Whether there are several answerers, each with a lapse rate to infer."""
+    return len(problem.answerers) > 1 and len(problem.lapse_rate.values) > 1
+
+
+def _chosen_with_lapses(
+    key: PRNGKeyArray, log_p: Values, margins: Float[Array, "n k"], unknowns: Unknowns, problem: JointProblem
+) -> tuple[Int[Array, ""], Unknowns]:
+    """One of n points, with its log probability but for the answers', and all lapse rates given it: drawn together.
+
+    The answers' probability at each point is summed over the lapse rates, which do not depend on each other.
+    """
+    key_point, key_lapses = random.split(key)
+    every = point_of(problem, unknowns)._replace(lapse_rate=problem.lapse_rate.values[:, None, None])
+    answers = jnp.einsum("ak,vnk->nav", problem.answerers, log_probabilities(problem, every, margins))
+    answers += problem.lapse_rate.log_probabilities
+    chosen = random.categorical(key_point, log_p + jnp.sum(logsumexp(answers, axis=2), axis=1))
+    return chosen, unknowns._replace(lapse_rate=random.categorical(key_lapses, answers[chosen], axis=1))
 
 
 def _steepness_move(
