@@ -204,13 +204,16 @@ def test_a_side_bias_and_two_answerers_agree_with_quadrature():
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [1, 2])
 def test_two_answerers_who_contradict_each_other_agree_with_quadrature(settings):
-    """Either may be the one who errs: a quarter of the posterior follows the one who gave an answer less."""
-    sizes = np.abs(np.random.default_rng(0).normal(size=(11, 1))) + 0.3
-    signs, answerers = np.repeat([1.0, -1.0], [6, 5])[:, None], np.repeat([0, 1], [6, 5])
+    """Either may be the one who errs: a quarter of the posterior follows the one who gave an answer less.
+
+    Without moves from one to the other chains stay with one of them.
+    """
+    sizes = np.abs(np.random.default_rng(0).normal(size=(23, 1))) + 0.3
+    signs, answerers = np.repeat([1.0, -1.0], [12, 11])[:, None], np.repeat([0, 1], [12, 11])
     rows = np.stack([sizes * signs, 1.4 * sizes[::-1] * signs])[:settings]
     expected, _ = quadrature(rows, answerers=answerers)
     for seed in range(3):
-        tree = sample_posterior(rows, **INFERRED, answerers=answerers, num_samples=2000, seed=seed)
+        tree = sample_posterior(rows, **INFERRED, answerers=answerers, max_samples=500, seed=seed)
         assert tree.attrs["converged"] == 1
         agree(tree, expected)
 
