@@ -49,7 +49,7 @@ BELOW = {
     "numerics": [],
     "environments": ["numerics"],
     "models": ["numerics"],
-    "policies": ["numerics", "environments"],
+    "policies": ["numerics"],
     "what flows round": ["numerics"],
     "estimate": ["numerics", "models", "what flows round"],
     **dict.fromkeys(STEPS, FLOWS),

@@ -17,8 +17,8 @@ from bayespbrl import Learner, ReturnExpert, cycle, rollouts
 from bayespbrl.envs import opening
 from bayespbrl.events import answered
 from bayespbrl.improvement.check import Check
-from bayespbrl.policies.actor import Actor
 from bayespbrl.rollouts import rollout
+from bayespbrl.runs.actor import Actor
 from bayespbrl.runs.files import write_netcdf
 
 FAST = {"max_steps": 8, "evaluation_episodes": 4, "centres": 20, "seed": 3, "hyperparameters": "given"}

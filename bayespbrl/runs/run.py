@@ -16,9 +16,9 @@ from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
 from bayespbrl.policies import Policy, Sampler
-from bayespbrl.policies.actor import Actor
 from bayespbrl.preferences import Preferences
 from bayespbrl.queries import QueryRule, highest_utility
+from bayespbrl.runs.actor import Actor
 from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.runs.directory import RunDirectory, fresh_directory
 from bayespbrl.runs.stored_classes import classes_of, from_tree, to_tree
