@@ -178,6 +178,22 @@ def test_first_draws_of_a_large_threshold_hide_no_setting(seed):
     assert 0.07 < np.mean(tree["posterior"]["setting"].values == 24) < 0.21
 
 
+@pytest.mark.parametrize("people", [1, 2])
+def test_settings_that_need_different_thresholds_both_keep_their_probability(people):
+    """Eight ordered answers, five ties; a setting whose margins are fifty times smaller needs a smaller threshold.
+
+    With threshold and setting drawn one after the other, chains stayed in the setting of larger margins, converged.
+    """
+    rng = np.random.default_rng(0)
+    ordered, near = np.abs(rng.standard_normal(8)) + 0.5, rng.standard_normal(5)
+    settings = np.stack([np.r_[0.02 * ordered, 0.004 * near], np.r_[ordered, 0.25 * near]])[..., None]
+    tied, answerers = np.arange(13) >= 8, np.arange(13) % people
+    tree = sample_posterior(settings, **INFERRED, indifferent=tied, answerers=answerers, max_samples=1000, seed=1)
+    expected, _ = quadrature(settings, tied=tied, answerers=answerers if people > 1 else None)
+    share = float((tree["posterior"]["setting"] == 0).mean())
+    assert share == pytest.approx(1 - expected["setting"], abs=0.1)
+
+
 def test_ties_that_contradict_each_other_are_lapses_and_the_chains_converge():
     """Of a Pendulum run where every third answer was a tie, whatever was shown: 4 settings, 16 ordered answers, 4 ties.
 

@@ -4,7 +4,7 @@ Steepness, lapse rates and threshold have a prior on a grid, and given the margi
 conditional distribution. The setting (length scales) is drawn given the *whitened* weights ξ, z = m + A ξ, with the
 Gaussian reference (m, A) of each setting: ξ means nearly the same under every setting, so that the move goes far. As
 the weights change with it, its probabilities carry the volume |A| (reversible jump with a deterministic map; Green
-1995). Between these moves the weights are sampled by elliptical slices.
+1995). Between these moves the weights are sampled by elliptical slices. Tie threshold and setting are drawn together.
 
 Where several people answer and contradict each other, one of them errs, and weights that follow another one need other
 lapse rates. Then the setting is drawn with the lapse rates summed out, and the weights and their mirror image too.
@@ -36,6 +36,8 @@ from bayespbrl.models.preference_problem import PreferenceProblem
 
 # Up to this many answers, padding included, the sampler makes more moves of other kinds.
 FEW = 64
+# So many others are tried in a move of setting and tie threshold: all would take twice the time and go no farther.
+OTHER_THRESHOLDS = 3
 STACKED = ("loadings", "used", "centre", "site_precisions", "root", "inverse_root")
 
 
@@ -168,19 +170,40 @@ def moved(
 def _setting_move(
     key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem
 ) -> tuple[Float[Array, " q"], Unknowns]:
-    """A setting drawn from its distribution given the whitened weights, and the weights under it."""
+    """Setting and tie threshold drawn from their distribution given the whitened weights, and the weights under it.
+
+    Together, because settings of different scale need different thresholds, and neither alone could then move.
+    """
     settings, now = problem.settings, unknowns.setting
+    key, key_thresholds = random.split(key) if len(problem.tie_threshold.values) > 1 else (key, key)
     whitened = settings.inverse_root[now] @ (z - settings.centre[now])
     points = settings.centre + settings.root @ whitened
     margins = jnp.einsum("skq,sq->sk", settings.loadings, points)
     log_prior = -0.5 * jnp.sum(points**2, axis=1) / settings.prior_scale**2  # eq. 7: log N(z; 0, σ²I)
     log_prior += jnp.sum(jnp.log(jnp.diagonal(settings.root, axis1=1, axis2=2)), axis=1)  # log |A| (Green 1995)
+    log_prior += problem.log_probabilities
+    number, (numbers, thresholds) = len(log_prior), _some_thresholds(key_thresholds, unknowns, problem)
+    log_prior = (log_prior + thresholds.log_probabilities[:, None]).ravel()
+    margins = jnp.tile(margins, (len(numbers), 1))
+    point = point_of(problem, unknowns)._replace(tie_threshold=jnp.repeat(thresholds.values, number)[:, None])
     if _several_err(problem):
-        setting, unknowns = _chosen_with_lapses(key, log_prior + problem.log_probabilities, margins, unknowns, problem)
+        chosen, lapse_rate = _chosen_with_lapses(key, log_prior, margins, point, problem)
     else:
-        log_p = log_likelihood(problem, unknowns, margins) + log_prior
-        setting = random.categorical(key, log_p + problem.log_probabilities)
-    return points[setting], unknowns._replace(setting=setting)
+        log_p = jnp.sum(log_probabilities(problem, point, margins), axis=1) + log_prior
+        chosen, lapse_rate = random.categorical(key, log_p), unknowns.lapse_rate
+    threshold, setting = numbers[chosen // number], chosen % number
+    return points[setting], unknowns._replace(setting=setting, lapse_rate=lapse_rate, tie_threshold=threshold)
+
+
+def _some_thresholds(key: PRNGKeyArray, unknowns: Unknowns, problem: JointProblem) -> tuple[Int[Array, " t"], Table]:
+    """The tie threshold as it is and some others at random, their numbers and their part of the prior.
+
+    Such a set is as probable whichever of its members was the present one, so that a draw among them is exact.
+    """
+    values, log_probabilities = problem.tie_threshold
+    others = 1 + random.permutation(key, len(values) - 1)[:OTHER_THRESHOLDS]
+    numbers = (unknowns.tie_threshold + jnp.append(others, 0)) % len(values)
+    return numbers, Table(values[numbers], log_probabilities[numbers])
 
 
 def _mirror_move(
@@ -193,8 +216,8 @@ def _mirror_move(
     """
     points = jnp.stack([z, -z])
     margins = points @ at_setting(problem.settings.loadings, unknowns.setting).T
-    chosen, unknowns = _chosen_with_lapses(key, jnp.zeros(2), margins, unknowns, problem)
-    return points[chosen], unknowns
+    chosen, lapse_rate = _chosen_with_lapses(key, jnp.zeros(2), margins, point_of(problem, unknowns), problem)
+    return points[chosen], unknowns._replace(lapse_rate=lapse_rate)
 
 
 def _several_err(problem: JointProblem) -> bool:
@@ -203,18 +226,18 @@ def _several_err(problem: JointProblem) -> bool:
 
 
 def _chosen_with_lapses(
-    key: PRNGKeyArray, log_p: Values, margins: Float[Array, "n k"], unknowns: Unknowns, problem: JointProblem
-) -> tuple[Int[Array, ""], Unknowns]:
+    key: PRNGKeyArray, log_p: Values, margins: Float[Array, "n k"], point: Point, problem: JointProblem
+) -> tuple[Int[Array, ""], Int[Array, " a"]]:
     """One of n points, with its log probability but for the answers', and all lapse rates given it: drawn together.
 
     The answers' probability at each point is summed over the lapse rates, which do not depend on each other.
     """
     key_point, key_lapses = random.split(key)
-    every = point_of(problem, unknowns)._replace(lapse_rate=problem.lapse_rate.values[:, None, None])
+    every = point._replace(lapse_rate=problem.lapse_rate.values[:, None, None])
     answers = jnp.einsum("ak,vnk->nav", problem.answerers, log_probabilities(problem, every, margins))
     answers += problem.lapse_rate.log_probabilities
     chosen = random.categorical(key_point, log_p + jnp.sum(logsumexp(answers, axis=2), axis=1))
-    return chosen, unknowns._replace(lapse_rate=random.categorical(key_lapses, answers[chosen], axis=1))
+    return chosen, random.categorical(key_lapses, answers[chosen], axis=1)
 
 
 def _steepness_move(
