@@ -1,6 +1,7 @@
 """The command line: what it runs, what it shows, and what it refuses."""
 
 import contextlib
+import importlib.metadata
 import io
 import json
 import os
@@ -247,6 +248,11 @@ def test_a_truncated_iteration_file_is_named(monkeypatch, capsys, tmp_path, fini
 
 
 @pytest.mark.slow
+def test_the_version_is_that_of_the_installed_package(monkeypatch, capsys):
+    assert call(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out == f"bayespbrl {importlib.metadata.version('bayespbrl')}\n"
+
+
 def test_the_module_runs_as_a_program():
     result = subprocess.run(
         [sys.executable, "-m", "bayespbrl", "run", "nowhere"], capture_output=True, text=True, check=False

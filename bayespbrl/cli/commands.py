@@ -2,9 +2,10 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import wraps
+from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -16,7 +17,7 @@ from bayespbrl.cli.compiled import keep_compiled
 from bayespbrl.cli.display import (
     PICTURE,
     ask_on_page,
-    check_page_installed,
+    check_expert,
     console,
     progress_bar,
     run_to_the_end,
@@ -114,6 +115,20 @@ RUN_OPTIONS = {
 }
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"bayespbrl {version('bayespbrl')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None: ...
+
+
 def _takes_run_options(command: Callable[..., None]) -> Callable[..., None]:
     """`command` with a parameter for each of `RUN_OPTIONS`, of the type that its part of the settings has.
 
@@ -147,7 +162,7 @@ def run(
     **options: Any,
 ) -> None:
     """Learn a task from preferences; the run is kept in a directory."""
-    _check_expert(options.get("expert"), answerer or [])
+    check_expert(options.get("expert"), answerer or [])
     for name, wanted in (("practice", practice), ("browser", browser)):
         if not wanted and (expert := options.get("expert")) != "page":
             raise ValueError(
@@ -171,7 +186,7 @@ def resume(
     with continuing(directory):
         learner = runs.resume(directory, import_package=import_package)
         if not learner.finished:
-            _check_expert(learner.settings.expert, answerer or [])
+            check_expert(learner.settings.expert, answerer or [])
             run_to_the_end(learner, directory, answerers=answerer or [])
         elif not (directory / PICTURE).exists():  # interrupted before it was drawn, or run in Python
             show_run(learner, directory)
@@ -317,27 +332,6 @@ def main() -> None:
             raise
         status = _print_error(error.format_message())
     sys.exit(status if isinstance(status, int) else 0)
-
-
-def _check_expert(name: str | None, answerers: Sequence[str]) -> None:
-    """Refuse an expert who cannot answer here, a name for a simulated one, and a page without its extra."""
-    for answerer in answerers:
-        checks.short_name("answerer", answerer)
-        if name not in ("terminal", "page"):
-            raise ValueError(
-                f"answerer: expected a name only with the expert page or terminal, got {answerer!r} with "
-                f"{name or 'return'}"
-            )
-    if len(set(answerers)) < len(answerers) or (name == "terminal" and len(answerers) > 1):
-        raise ValueError(
-            f"answerer: expected a different name for each person, and one person at the terminal, got {answerers}"
-        )
-    if name == "other":
-        raise ValueError(
-            "expert: expected a simulated expert, page or terminal, got other; continue in Python with Learner.run"
-        )
-    if name == "page":
-        check_page_installed()
 
 
 def _print_error(message: str) -> int:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
+from bayespbrl import checks
 from bayespbrl.cli.opening import Place, open_in_browser, somebody_looks
 from bayespbrl.envs.opening import open_environment
 from bayespbrl.envs.stepping import of_whole_episodes
@@ -109,6 +110,27 @@ def ask_on_page(
         show_run(learner, directory)
     else:
         console.print(f"This continues: {again}")
+
+
+def check_expert(name: str | None, answerers: Sequence[str]) -> None:
+    """Refuse an expert who cannot answer here, a name for a simulated one, and a page without its extra."""
+    for answerer in answerers:
+        checks.short_name("answerer", answerer)
+        if name not in ("terminal", "page"):
+            raise ValueError(
+                f"answerer: expected a name only with the expert page or terminal, got {answerer!r} with "
+                f"{name or 'return'}"
+            )
+    if len(set(answerers)) < len(answerers) or (name == "terminal" and len(answerers) > 1):
+        raise ValueError(
+            f"answerer: expected a different name for each person, and one person at the terminal, got {answerers}"
+        )
+    if name == "other":
+        raise ValueError(
+            "expert: expected a simulated expert, page or terminal, got other; continue in Python with Learner.run"
+        )
+    if name == "page":
+        check_page_installed()
 
 
 def check_page_installed() -> None:
