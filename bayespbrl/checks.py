@@ -89,7 +89,7 @@ def dense(name: str, values: Any) -> np.ndarray:
     try:
         return np.asarray(values.toarray() if hasattr(values, "toarray") else values)
     except ValueError as error:
-        raise ValueError(f"{name}: expected rows of numbers, all equally long, got {_shortened(values)}") from error
+        raise ValueError(f"{name}: expected rows of numbers, all equally long, got {shortened(values)}") from error
 
 
 def finite(name: str, values: Any) -> None:
@@ -97,7 +97,7 @@ def finite(name: str, values: Any) -> None:
     try:
         fits = bool(np.all(np.isfinite(values)))
     except (TypeError, ValueError) as error:  # text, None, rows of different lengths
-        raise ValueError(f"{name}: expected finite numbers, got {_shortened(values)}") from error
+        raise ValueError(f"{name}: expected finite numbers, got {shortened(values)}") from error
     if not fits:
         raise ValueError(f"{name}: expected finite entries, got NaN or infinity")
 
@@ -108,7 +108,7 @@ def matrix(name: str, values: Any, *, columns: int | None = None) -> np.ndarray:
         given = np.asarray(values)
         array = np.asarray(given.real, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: expected rows of numbers, all equally long, got {_shortened(values)}") from error
+        raise ValueError(f"{name}: expected rows of numbers, all equally long, got {shortened(values)}") from error
     if np.ma.is_masked(values) or np.iscomplexobj(given):
         raise ValueError(f"{name}: expected real numbers, got masked or complex entries")
     if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
@@ -147,11 +147,11 @@ def pairs(name: str, values: Any) -> np.ndarray:
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name}: expected pairs of integers, got {_shortened(values)}") from error
+        raise ValueError(f"{name}: expected pairs of integers, got {shortened(values)}") from error
     if array.shape in ((0,), (0, 2)):
         return np.zeros((0, 2), dtype=np.int64)
     if array.ndim != 2 or array.shape[1] != 2 or not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"{name}: expected pairs of integers, got {_shortened(values)}")
+        raise ValueError(f"{name}: expected pairs of integers, got {shortened(values)}")
     return array.astype(np.int64)
 
 
@@ -165,11 +165,13 @@ def reason(error: Exception) -> str:
     return one_line(error) or type(error).__name__
 
 
-def _shortened(values: Any) -> str:
+def shortened(values: Any) -> str:
+    """The representation of a value in one line of at most 61 characters."""
     text = one_line(repr(values))
     return text if len(text) <= 60 else text[:60] + "…"
 
 
 def _is_number(value: Any) -> bool:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool | np.timedelta64)
+    value = float(value) if isinstance(value, np.floating) else value  # else float32 overflows in the comparison
     return number and -sys.float_info.max <= value <= sys.float_info.max  # a whole number may be larger than any float

@@ -182,7 +182,8 @@ class Cycle:
         number, newcomer, options = state.queries + 1, self._newcomers(state)[0], self.settings.questions
         left = options.left(state.preferences.answers + state.wanted + len(state.open))
         rng, who = self._rng(REPEAT, number), {} if answerer is None else {"answerer": answerer}
-        again = questions.repeated(state.past, number, options, left=left, rng=rng, answerer=answerer)
+        waiting = [each.repeats for each in state.open]
+        again = questions.repeated(state.past, number, options, left=left, rng=rng, answerer=answerer, waiting=waiting)
         if again is not None:
             shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
             return _entry({"event": "asked", "query": number, **shown, "repeats": again.number, **who})

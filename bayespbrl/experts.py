@@ -21,7 +21,7 @@ from bayespbrl.trajectories import Trajectory
 # Of the sum of the absolute rewards: rounding in another order of summation must not decide.
 TIE_TOLERANCE = 1e-9
 # Ends of the seeds, so that one expert within another with the same seed errs independently. `NoisyExpert` has none.
-TEACHER, MARGIN = 1, 2
+TEACHER, MARGIN, NESTED = 1, 2, 3
 
 
 class Expert(Protocol):
@@ -61,7 +61,9 @@ class NoisyExpert:
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
         answer = parse_answer(self.expert(first, second))
-        within = (self._depth,) if self._depth else ()  # each has a stream of its own; a single one is as it ever was
+        within = (
+            (NESTED, self._depth) if self._depth else ()
+        )  # each has a stream of its own; a single one is as it ever was
         return _reversed(answer) if _chance(self.seed, first, second, *within) < self.wrong_answers else answer
 
     @property

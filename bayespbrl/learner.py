@@ -16,7 +16,7 @@ from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
 from bayespbrl.policies import Policy, Sampler, greedy
-from bayespbrl.policies.choice import fitting, initial_policy
+from bayespbrl.policies.choice import expected_policy, fitting, initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
 from bayespbrl.settings import Settings, Task, settings_for
 from bayespbrl.trajectories import Trajectory
@@ -68,8 +68,8 @@ class Learner:
                 raise ValueError(
                     f"{name}: expected a function{'' if name == 'features' else ' or a name'}, got {given!r}"
                 )
-        if policy is not None and not isinstance(policy, str | Policy):
-            raise ValueError(f"policy: expected a policy (bayespbrl.policies) or a kind by name, got {policy!r}")
+        if policy is not None and (isinstance(policy, type) or not isinstance(policy, str | Policy)):
+            raise ValueError(f"policy: expected {expected_policy(policy)}")
         if "environment" in options:
             raise ValueError(
                 f"environment: expected the environment as env only, got environment={options['environment']!r} too"

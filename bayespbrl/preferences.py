@@ -277,10 +277,15 @@ def pair_differences(
       ValueError: no pairs of integers; a pair with an unknown trajectory, or with the same one twice.
     """
     numbers = checks.pairs("pairs", pairs)
-    if np.any(numbers < 0) or np.any(numbers >= len(trajectory_features)):
-        raise ValueError(f"pairs: expected trajectory numbers in 0 … {len(trajectory_features) - 1}, got {pairs}")
-    if np.any(numbers[:, 0] == numbers[:, 1]):
-        raise ValueError(f"pairs: expected two different trajectories in each, got {pairs}")
+    most = len(trajectory_features) - 1
+    for expected, bad in (
+        (f"trajectory numbers in 0 … {most}", np.any((numbers < 0) | (numbers > most), axis=1)),
+        ("two different trajectories in each", numbers[:, 0] == numbers[:, 1]),
+    ):
+        if bad.any():
+            raise ValueError(
+                f"pairs: expected {expected}, got {tuple(numbers[bad][0].tolist())} as number {bad.argmax()}"
+            )
     return trajectory_features[numbers[:, 0]] - trajectory_features[numbers[:, 1]]  # eq. 5
 
 

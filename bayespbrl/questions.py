@@ -4,7 +4,7 @@ In which order trajectories are worth asking about is a query rule's matter (`qu
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -144,6 +144,7 @@ def repeated(
     left: float,
     rng: np.random.Generator,
     answerer: str | None = None,
+    waiting: Collection[int | None] = (),
 ) -> PastQuestion | None:
     """The earlier question that question `number` repeats; None where a new one is due.
 
@@ -153,8 +154,9 @@ def repeated(
       rng: chooses among one person's that have not been repeated, without the last few of all and of that person; among
         all people's where repeats are shared.
       answerer: who is asked, since only who answered a question can be consistent; None: whoever answered last.
+      waiting: the numbers of the questions that those repeat which wait for other people.
     """
-    done = {question.repeats for question in past}
+    done = {question.repeats for question in past} | set(waiting)
     if len(done - {None}) >= int(options.repeats * number + 1e-9) or left < 1:
         return None
     person = past[-1].answerer if past and answerer is None else answerer

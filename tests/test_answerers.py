@@ -286,6 +286,15 @@ def test_of_several_people_nobody_is_asked_again_what_they_were_asked_just_now()
     assert {one.number for one in of("Ben")} == {3, 4, 5}
 
 
+def test_a_question_that_is_being_repeated_to_somebody_is_not_repeated_to_another():
+    past = [PastQuestion(n, 0, n, n, None, Answer.FIRST, "Ada", None) for n in range(1, 9)]
+    options, rng = Questions(repeats=0.2, shared_repeats=True), np.random.default_rng(0)
+    for waiting in [(), (1,), (None, 2)]:
+        again = {repeated(past, 10, options, left=10, rng=rng, answerer="Ben", waiting=waiting) for _ in range(50)}
+        assert not {one.number for one in again} & set(waiting)
+    assert repeated(past, 10, options, left=10, rng=rng, answerer="Ben", waiting=(1, 2)) is None  # a fifth of ten
+
+
 def test_people_are_asked_a_tenth_again_and_wait_for_no_silent_iteration():
     people, simulated = (Learner("gridworld", expert=expert).settings for expert in ("other", "return"))
     assert people.questions.repeats == 0.1
@@ -520,8 +529,14 @@ def test_a_utility_is_inferred_from_answers_collected_elsewhere(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("first,second\n0,1\n", "expected the columns first, second, answer, got first, second"),
-        ("", "expected the columns first, second, answer, got none"),
+        (
+            "first,second\n0,1\n",
+            "expected the columns first, second, answer, each once and separated by commas, got first, second",
+        ),
+        ("", "expected the columns first, second, answer, each once and separated by commas, got none"),
+        ("first;second;answer\n0;1;first\n", "separated by commas, got first;second;answer"),
+        ("first,second,answer,answer\n0,1,first,tie\n", "each once .* got first, second, answer, answer"),
+        ("first,second,answer\n0,1,first,Ada\n", "line 2: expected a cell for each column, got 1 more"),
         ("first,second,answer\n0,1,first\n0,x,first\n", "line 3: second: expected a whole number >= 0, got 'x'"),
         ("first,second,answer\n0,1,first\n,1,first\n", "line 3: first: expected a whole number >= 0, got ''"),
         ("first,second,answer\n0,-1,first\n", "line 2: second: expected a whole number >= 0"),

@@ -176,6 +176,8 @@ def test_calibration_of_a_posterior_predicts_with_its_own_model_by_refits():
 def test_predictions_that_a_run_made_are_scored_as_they_are(monkeypatch, tree):
     monkeypatch.setattr(predictions, "posterior_draws", None)
     predicted, first = np.array([0.5, 0.2, 0.9]), np.array([True, False, True])
+    with pytest.raises(ValueError, match="first_preferred: expected which were preferred"):
+        calibration(tree, predicted=predicted)
     result = calibration(tree, first, predicted=predicted)
     assert float(result["log_score"]) == pytest.approx(np.log(0.5 * 0.8 * 0.9))
 
@@ -248,7 +250,10 @@ def test_invalid_predictions_are_refused(arguments, message):
     [
         ({"first_preferred": np.array([1, 0, 1])}, "first_preferred: expected bool"),
         ({"first_preferred": np.ones(2, dtype=bool)}, r"first_preferred: expected .* got .*\(2,\)"),
-        ({"predicted": np.full(2, 0.5)}, r"predicted: expected shape \(3,\), got \(2,\)"),
+        (
+            {"predicted": np.full(2, 0.5), "first_preferred": np.ones(3, bool)},
+            r"predicted: expected shape \(3,\), got \(2,\)",
+        ),
         ({"groups": np.array([0, 1, 0])}, "groups: expected 3 integers that never decrease, got"),
         ({"groups": np.array([0.0, 1.0, 2.0])}, "groups: expected"),
     ],

@@ -159,6 +159,13 @@ def test_the_mistaken_teacher_errs_as_often_as_told_and_on_top_of_the_stochastic
     assert close(wrong_share(Teacher(1.0, mistakes=0.2), 1.0), 0.8 * by_chance + 0.2 * (1 - by_chance))
 
 
+def test_an_expert_who_is_reversed_twice_errs_independently_each_time():
+    errs, expert = 0.0, Teacher(mistakes=0.3, seed=3)
+    for chance in (0.3, 0.3, 0.3):
+        errs = errs * (1 - chance) + (1 - errs) * chance
+    assert close(wrong_share(NoisyExpert(NoisyExpert(expert, 0.3, seed=3), 0.3, seed=3), 5.0), errs)
+
+
 @pytest.mark.parametrize("expert", [Teacher(mistakes=0.1, seed=3), MarginExpert(2.0, seed=3)])
 def test_an_expert_who_errs_and_is_reversed_with_the_same_seed_errs_independently(expert):
     errs = 0.1 if isinstance(expert, Teacher) else expert.error_probability(1.0)

@@ -836,6 +836,25 @@ class Ordinary:
         return self
 
 
+class WithoutEntropy:
+    """All of a policy but its entropy."""
+
+    initial, sample, log_prob, kl_divergence, fit = (None,) * 5
+
+
+@pytest.mark.parametrize(
+    ("policy", "expected"),
+    [
+        (TabularPolicy, "policy: expected a policy, an object, got the class TabularPolicy"),
+        (WithoutEntropy(), "policy: expected a policy .*, got a WithoutEntropy without entropy"),
+        (3, "policy: expected a policy .* or a kind by name, got 3"),
+    ],
+)
+def test_what_a_policy_lacks_is_named(policy, expected):
+    with pytest.raises(ValueError, match=expected):
+        Learner("gridworld", policy=policy)
+
+
 @pytest.mark.parametrize(
     ("env", "policy"),
     [
@@ -846,6 +865,7 @@ class Ordinary:
         ("swing-up", LinearGaussianPolicy.initial(Box(-1, 1, (2,)), Box(-1, 1, (2,)))),
         ("swing-up", TabularPolicy.initial(Discrete(25), Discrete(3))),
         ("gridworld", Ordinary()),
+        ("gridworld", TabularPolicy(np.ones((25, 5)))),
     ],
 )
 def test_a_policy_that_does_not_suit_the_environment_is_refused(env, policy):

@@ -1,5 +1,6 @@
 """Results of studies: intervals against known values, tables against hand-made data, what is refused."""
 
+import itertools
 import json
 import shutil
 import sys
@@ -31,6 +32,7 @@ from bayespbrl.results.intervals import (
     median_interval,
     paired_difference,
     performance_profile,
+    signed_rank_test,
 )
 from bayespbrl.results.study_data import StudyData
 from bayespbrl.studies import Study
@@ -322,6 +324,22 @@ def test_equal_trials_do_not_differ_and_shifted_ones_do():
     interval, p = paired_difference(values + 3, values)
     assert interval == (3, 3, 3)
     assert p < 0.001
+
+
+@pytest.mark.parametrize("number", [3, 8, 12])
+def test_the_p_value_of_a_paired_comparison_is_that_of_all_signs(number):
+    rng = np.random.default_rng(number)
+    for _ in range(10):
+        differences = rng.integers(-2, 4, number) * 0.1  # some are zero, some equal
+        unequal = differences != 0
+        ranks = np.where(unequal, stats.rankdata(np.abs(np.round(differences, 9))), 0)
+        sums = np.array(list(itertools.product((-1, 1), repeat=number))) @ ranks
+        expected = np.mean(np.abs(sums) >= abs(np.sign(differences) @ ranks) - 1e-9)
+        assert signed_rank_test(differences) == pytest.approx(expected)
+
+
+def test_three_unequal_pairs_of_twenty_show_nothing():
+    assert signed_rank_test(np.r_[np.zeros(17), 1.0, 2.0, 3.0]) == 0.25  # a normal approximation has 0.08
 
 
 def test_a_performance_profile_averages_tasks_and_not_trials():

@@ -691,6 +691,27 @@ def test_another_environment_than_the_runs_is_refused(copy, read, env):
     assert contents(copy) == before
 
 
+class Longer(Corridor):
+    """More states than the corridor's, which are among them."""
+
+    observation_space = gymnasium.spaces.Discrete(9)
+
+
+def test_an_environment_with_more_states_than_the_policy_has_is_refused(tmp_path):
+    options = {
+        "preset": "paper",
+        "utility": "linear-program",
+        "iterations": 2,
+        "max_steps": 12,
+        "evaluation_episodes": 2,
+    }
+    bayespbrl.start(Corridor(), tmp_path / "run", **options).run(ReturnExpert())
+    before = contents(tmp_path / "run")
+    with pytest.raises(ValueError, match=r"run: policy: expected one from Discrete\(9\) to "):
+        runs.resume(tmp_path / "run", env=Longer())
+    assert contents(tmp_path / "run") == before
+
+
 @pytest.mark.slow
 def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_come_back(tmp_path):
     options = {

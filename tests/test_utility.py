@@ -62,6 +62,12 @@ def test_the_utility_of_a_step_is_that_of_its_next_state():
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_no_states_have_no_utilities(method):
+    estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method=method, discount=0.9)
+    assert estimate.utilities(np.arange(0)).shape == (0,)
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_features_in_other_units_give_the_same_utilities(method):
     plain = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method=method, discount=0.9)
     scaled = estimate_utility(TRAJECTORIES, PAIRS, lambda s: 1024.0 * ONE_HOT(s), method=method, discount=0.9)

@@ -34,7 +34,8 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
 
     Returns:
       along `check`: `observed`, the mean over the draws; `expected`, `lower` and `upper`, mean and central 90 %
-      interval of the simulated count; `possible`, the largest count; `p_value`, NaN where nothing was possible.
+      interval of the simulated count; `possible`, the largest count (of cycles the number of triads, not all of which
+      can be cycles at once); `p_value`, NaN where nothing was possible.
 
     Raises:
       ValueError: fewer than one draw.

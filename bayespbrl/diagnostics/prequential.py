@@ -73,9 +73,9 @@ def calibration(
     Args:
       tree: what `sample_posterior` returned for all K answers, in their order.
       first_preferred: whether the preferred one was shown first, shape (K,) bool. None: drawn by a fair coin from
-        `seed`, and the attribute `order` is "drawn". Only the reliability curve depends on it, not the scores.
-      predicted: probabilities that the first shown is preferred, shape (K,), as recorded during a run. None: by exact
-        refits, K − 1 of them.
+        `seed`, and the attribute `order` is "drawn"; log score and Brier score do not depend on it.
+      predicted: probabilities that the first shown is preferred, shape (K,), as recorded during a run; they need
+        `first_preferred`. None: by exact refits, K − 1 of them.
       groups: the number of the answer that each row follows from, shape (K,), never decreasing. The pair that was asked
         about is the last row of its answer; only that row is scored.
       seed: of drawn orders and of the curve's band.
@@ -87,6 +87,8 @@ def calibration(
     differences = np.asarray(tree["constant_data"]["differences"])
     number, tied = differences.shape[-2], predictions.tied_rows(tree)
     order = "drawn" if first_preferred is None else "given"
+    if predicted is not None and first_preferred is None:
+        raise ValueError("first_preferred: expected which were preferred of those that predicted is about, got None")
     if first_preferred is None:
         first_preferred = np.asarray(np.random.default_rng(seed).random(number) < 0.5)
     first_preferred = checks.flags("first_preferred", first_preferred, number)
@@ -230,7 +232,11 @@ def _calibration_error(predicted: np.ndarray, outcomes: np.ndarray) -> dict[str,
     name = "expected_calibration_error"
     if len(predicted) == 0:
         return dict.fromkeys((name, f"{name}_expected", f"{name}_sd"), np.nan)
-    confidence, right = np.maximum(predicted, 1 - predicted), np.where(predicted >= 0.5, outcomes, ~outcomes)
+    confidence, right = (
+        np.maximum(predicted, 1 - predicted),
+        np.where(predicted > 0.5, outcomes, ~outcomes).astype(float),
+    )
+    right[:, predicted == 0.5] = 0.5  # a coin is neither right nor wrong
     one_hot = np.minimum((confidence * 10).astype(int), 9)[:, None] == np.arange(10)
     errors = np.sum(np.abs((right - confidence) @ one_hot), axis=1) / len(predicted)
     return {name: errors[0], f"{name}_expected": np.mean(errors[1:]), f"{name}_sd": np.std(errors[1:])}

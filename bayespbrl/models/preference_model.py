@@ -150,7 +150,8 @@ def _numbered(
     if any(isinstance(each, str) for each in who.flat):
         if who.shape != (number,) or not all(isinstance(each, str) for each in who):
             raise ValueError(
-                f"answerers: expected {number} names, one for each answer and '' for a person without, got {who}"
+                f"answerers: expected {number} names, one for each answer and '' for a person without, got "
+                f"{checks.shortened(who.tolist())}"
             )
         given = [str(each) for each in who]
         names = tuple(dict.fromkeys(given)) if names is None else names
@@ -169,7 +170,7 @@ def _numbers(name: str, values: ArrayLike, number: int, least: int, most: int) -
     array = np.asarray(values)
     array = array.astype(int) if array.shape == (0,) else array  # an empty list has no type
     if array.shape != (number,) or array.dtype.kind not in "iu" or np.any((array < least) | (array > most)):
-        raise ValueError(f"{name}: expected {number} whole numbers in {least} … {most}, got {checks.one_line(values)}")
+        raise ValueError(f"{name}: expected {number} whole numbers in {least} … {most}, got {checks.shortened(values)}")
     return array
 
 

@@ -59,7 +59,20 @@ def initial_policy(
             kind = "tabular" if isinstance(observation_space, Discrete) else "softmax"
     if kind not in POLICIES:
         raise ValueError(f"policy: expected one of auto, {', '.join(POLICIES)}, got {kind!r}")
-    return POLICIES[kind]((observation_space, action_space), action_scale, period)
+    try:
+        return POLICIES[kind]((observation_space, action_space), action_scale, period)
+    except ValueError as error:
+        raise ValueError(f"policy {kind}: {error}") from error
+
+
+def expected_policy(given: object) -> str:
+    """What was expected where something was given that is no policy, for an error."""
+    if isinstance(given, type):
+        return f"a policy, an object, got the class {given.__name__}"
+    methods = ("initial", "sample", "log_prob", "entropy", "kl_divergence", "fit")
+    if (lacks := [name for name in methods if not hasattr(given, name)]) and len(lacks) < len(methods):
+        return f"a policy (bayespbrl.policies.Policy), got a {type(given).__name__} without {', '.join(lacks)}"
+    return f"a policy (bayespbrl.policies) or a kind by name, got {given!r}"
 
 
 def fitting(policy: Policy, observation_space: Space[Any], action_space: Space[Any]) -> Policy:
@@ -83,6 +96,10 @@ def fitting(policy: Policy, observation_space: Space[Any], action_space: Space[A
             got = np.asarray(policy.probabilities(observation[None])).shape
         else:
             got = np.asarray(policy.sample(jax.random.key(0), observation)).shape
+        if got == expected and is_discrete(policy):
+            chances = np.asarray(policy.probabilities(observation[None]))
+            if not (np.all(chances >= 0) and np.isclose(chances.sum(), 1, atol=1e-3)):
+                raise ValueError(f"probabilities {checks.shortened(chances[0].tolist())}")
         if got == expected:  # what the first update needs
             if not is_pytree(policy):
                 raise ValueError("one that is no JAX pytree of arrays")

@@ -53,15 +53,31 @@ def paired_difference(values: np.ndarray, reference: np.ndarray) -> tuple[Interv
 
     Args:
       values, reference: of the same seeds, shape (S,).
-
-    Source: Wilcoxon (1945); differences of zero as by Pratt (1959).
     """
     differences = np.asarray(values, dtype=np.float64) - np.asarray(reference, dtype=np.float64)
     if np.any(np.isnan(differences)):
         return median_interval(differences), np.nan
-    if len(differences) < 2 or not np.any(differences):
-        return median_interval(differences), 1.0
-    return median_interval(differences), float(stats.wilcoxon(differences, zero_method="pratt").pvalue)
+    return median_interval(differences), signed_rank_test(differences)
+
+
+def signed_rank_test(differences: np.ndarray) -> float:
+    """The exact two-sided p value of Wilcoxon's signed-rank test of differences of shape (S,).
+
+    Differences of zero have ranks but no sign. Where many are zero, a normal approximation gives p values that are too
+    small: three of twenty differences, all positive, have p = 0.25 and not 0.08.
+
+    Source: Wilcoxon (1945); differences of zero as by Pratt (1959); the distribution by summation over the signs.
+    """
+    sizes = np.abs(differences) / (np.max(np.abs(differences), initial=0) or 1)
+    ranks = np.rint(2 * stats.rankdata(np.round(sizes, 12))).astype(int)  # doubled: those of equal ones may be halves
+    signed, positive = ranks[sizes > 0], ranks[np.asarray(differences) > 0].sum()
+    probabilities = np.zeros(signed.sum() + 1)
+    probabilities[0] = 1.0
+    for rank in signed:  # plus or minus, equally probable
+        probabilities[rank:] = probabilities[rank:] + probabilities[: len(probabilities) - rank]
+        probabilities /= 2
+    sums = 2 * np.arange(len(probabilities)) - signed.sum()
+    return float(min(probabilities[np.abs(sums) >= abs(2 * positive - signed.sum())].sum(), 1.0))
 
 
 def sign_test(less: int, more: int) -> float:

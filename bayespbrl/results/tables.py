@@ -262,7 +262,9 @@ def _scores(answers: pd.DataFrame) -> dict[str, str]:
 
 def calibration_line(predicted: np.ndarray, observed: np.ndarray) -> dict[str, str]:
     """How well n probabilities predicted n outcomes, shapes (n,), as the cells of a table."""
-    scores = score_predictions(np.clip(predicted, 0, 1), observed)
+    least = 5e-7  # a table has six digits, which make a larger prediction a 1
+    predicted = np.clip(predicted, least, 1 - least)
+    scores = score_predictions(predicted, observed)
     score, expected, deviation, z = (float(scores[f"log_score{end}"]) for end in ("", "_expected", "_sd", "_z"))
     error, chance, by_chance = (float(scores[f"expected_calibration_error{end}"]) for end in ("", "_expected", "_sd"))
     confidence = np.maximum(predicted, 1 - predicted)

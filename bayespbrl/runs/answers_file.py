@@ -4,7 +4,7 @@ import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -71,9 +71,10 @@ def read_answers(file: Path | str) -> CollectedAnswers:
     try:
         lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig"), newline=""))
         lines.fieldnames = [name.strip() for name in lines.fieldnames or ()]
-        if not set(NEEDED) <= set(lines.fieldnames or ()):
+        if not set(NEEDED) <= set(lines.fieldnames) or len(set(lines.fieldnames)) < len(lines.fieldnames):
             raise ValueError(
-                f"expected the columns {', '.join(NEEDED)}, got {', '.join(lines.fieldnames or ()) or 'none'}"
+                f"expected the columns {', '.join(NEEDED)}, each once and separated by commas, got "
+                f"{', '.join(lines.fieldnames) or 'none'}"
             )
         rows = [_row(line, lines.line_num) for line in lines]
     except (OSError, ValueError, csv.Error) as error:
@@ -87,8 +88,10 @@ def read_answers(file: Path | str) -> CollectedAnswers:
     return CollectedAnswers(tuple(every[:number]), tuple(every[number:]), sides, names if any(names) else None)
 
 
-def _row(line: dict[str, str | None], number: int) -> tuple[int, int, Answer, str]:
+def _row(line: dict[Any, Any], number: int) -> tuple[int, int, Answer, str]:
     try:
+        if None in line:
+            raise ValueError(f"expected a cell for each column, got {len(line[None] or ())} more")
         first, second = (_row_number(name, line[name]) for name in ("first", "second"))
         if first == second:
             raise ValueError(f"second: expected another number than first, got {second} twice")

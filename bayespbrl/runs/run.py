@@ -16,6 +16,7 @@ from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
 from bayespbrl.policies import Policy, Sampler
+from bayespbrl.policies.choice import fitting
 from bayespbrl.preferences import Preferences
 from bayespbrl.queries import QueryRule, highest_utility
 from bayespbrl.runs.actor import Actor
@@ -142,6 +143,8 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
                 raise ValueError(f"env: expected a time limit of {len(trajectory)} steps or more, got {limit}")
             check_of_space("states of the run", trajectory.states, learner.environment.observation_space)
             check_of_space("actions of the run", trajectory.actions, learner.environment.action_space)
+        if env is not None:  # of more states or actions than the run's, which those of the trajectories are among
+            fitting(learner.last_policy, learner.environment.observation_space, learner.environment.action_space)
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
     return learner

@@ -181,7 +181,7 @@ class PosteriorUtility:
         draws = np.empty((*settings.shape, len(values[0])))
         for its, columns in zip(chosen, values, strict=True):
             draws[its] = columns[:, 1:].T
-        return np.sum([columns[:, 0] for columns in values], axis=0), draws.reshape(-1, draws.shape[2])
+        return np.sum([columns[:, 0] for columns in values], axis=0), draws.reshape(settings.size, draws.shape[2])
 
 
 def spacing(total: int, number: int | None) -> int:

@@ -102,7 +102,8 @@ def _maps(table: xr.Dataset) -> list[Picture]:
     where = PLACES[table.attrs["kind"]]
     if table.attrs["kind"] in ("list", "line"):
         bands = [("Utility of the states", partial(figures.plot_state_bands, table))]
-        caption = f"Utility {where}: posterior mean ± two standard deviations. The scale is arbitrary."
+        bars = "posterior mean ± two standard deviations" if "sd" in table else "as the learner used it"
+        caption = f"Utility {where}: {bars}. The scale is arbitrary."
         return [drawn("utility", bands, caption, f"Utility {where}.", size=(7.6, 3.2))]
     blank = np.where(table["reached"].values, 0.0, np.nan)
     used = ("used", "Utility that the learner used", "utility", "viridis")
