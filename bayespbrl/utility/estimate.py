@@ -53,7 +53,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
-        """The utility wᵀφ(s) of n states."""
+        """The utility wᵀφ(s) of n states, flattened as in `Trajectory.states`."""
         ...
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:

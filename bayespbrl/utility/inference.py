@@ -119,6 +119,10 @@ def infer_utility(
       steepness, lapse_rate, tie_threshold: None: inferred, the threshold where there are ties.
       seed: of the sampler.
 
+    Returns:
+      the estimate; its `weights` are in the units of the features. The draws of `utility_weights` in its `posterior` are
+      of features divided by its `scales`.
+
     Raises:
       ValueError: an unknown method, feature sums that are no finite matrix, pairs that name no row, and any other
         argument that is not as above, whether the method uses it or not.
