@@ -120,8 +120,8 @@ def infer_utility(
       seed: of the sampler.
 
     Returns:
-      the estimate; its `weights` are in the units of the features. The draws of `utility_weights` in its `posterior` are
-      of features divided by its `scales`.
+      the estimate; its `weights` are in the units of the features. The draws of `utility_weights` in its `posterior`
+      are of features divided by its `scales`.
 
     Raises:
       ValueError: an unknown method, feature sums that are no finite matrix, pairs that name no row, and any other
