@@ -248,11 +248,6 @@ def test_a_truncated_iteration_file_is_named(monkeypatch, capsys, tmp_path, fini
 
 
 @pytest.mark.slow
-def test_no_command_lists_the_commands(monkeypatch, capsys):
-    assert call(monkeypatch) == 0
-    assert "Learn a task from preferences" in capsys.readouterr().out
-
-
 def test_the_version_is_that_of_the_installed_package(monkeypatch, capsys):
     assert call(monkeypatch, "--version") == 0
     assert capsys.readouterr().out == f"bayespbrl {importlib.metadata.version('bayespbrl')}\n"

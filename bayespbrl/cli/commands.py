@@ -318,7 +318,7 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
-        status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
+        status = app(standalone_mode=False)
     except (ValueError, OSError) as error:
         status = _print_error(str(error))
     except MemoryError as error:
