@@ -247,12 +247,12 @@ def test_a_truncated_iteration_file_is_named(monkeypatch, capsys, tmp_path, fini
     assert file.stat().st_size == 1000
 
 
-@pytest.mark.slow
 def test_the_version_is_that_of_the_installed_package(monkeypatch, capsys):
     assert call(monkeypatch, "--version") == 0
     assert capsys.readouterr().out == f"bayespbrl {importlib.metadata.version('bayespbrl')}\n"
 
 
+@pytest.mark.slow
 def test_the_module_runs_as_a_program():
     result = subprocess.run(
         [sys.executable, "-m", "bayespbrl", "run", "nowhere"], capture_output=True, text=True, check=False

@@ -691,6 +691,15 @@ def test_another_environment_than_the_runs_is_refused(copy, read, env):
     assert contents(copy) == before
 
 
+IN_THE_CORRIDOR = {
+    "preset": "paper",
+    "utility": "linear-program",
+    "iterations": 2,
+    "max_steps": 12,
+    "evaluation_episodes": 2,
+}
+
+
 class Longer(Corridor):
     """More states than the corridor's, which are among them."""
 
@@ -698,14 +707,7 @@ class Longer(Corridor):
 
 
 def test_an_environment_with_more_states_than_the_policy_has_is_refused(tmp_path):
-    options = {
-        "preset": "paper",
-        "utility": "linear-program",
-        "iterations": 2,
-        "max_steps": 12,
-        "evaluation_episodes": 2,
-    }
-    bayespbrl.start(Corridor(), tmp_path / "run", **options).run(ReturnExpert())
+    bayespbrl.start(Corridor(), tmp_path / "run", **IN_THE_CORRIDOR).run(ReturnExpert())
     before = contents(tmp_path / "run")
     with pytest.raises(ValueError, match=r"run: policy: expected one from Discrete\(9\) to "):
         runs.resume(tmp_path / "run", env=Longer())
@@ -714,15 +716,8 @@ def test_an_environment_with_more_states_than_the_policy_has_is_refused(tmp_path
 
 @pytest.mark.slow
 def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_come_back(tmp_path):
-    options = {
-        "preset": "paper",
-        "utility": "linear-program",
-        "iterations": 2,
-        "max_steps": 12,
-        "evaluation_episodes": 2,
-    }
     directory = tmp_path / "run"
-    learner = bayespbrl.start(Corridor(), directory, **options).run(ReturnExpert())
+    learner = bayespbrl.start(Corridor(), directory, **IN_THE_CORRIDOR).run(ReturnExpert())
     assert len({len(trajectory) for trajectory in learner.trajectories}) > 1
     assert any(trajectory.terminated for trajectory in learner.trajectories)
     with pytest.raises(ValueError, match="run: expected env= again, which the run was started with, got None"):
@@ -732,7 +727,7 @@ def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_c
     run = bayespbrl.load(directory, env=Corridor())
     assert fingerprint(run.learner) == fingerprint(learner)
     assert run.policy.act(3) in (0, 1)
-    stopped = bayespbrl.start(Corridor(), tmp_path / "stopped", **options)
+    stopped = bayespbrl.start(Corridor(), tmp_path / "stopped", **IN_THE_CORRIDOR)
     stopped.tell([ReturnExpert()(*stopped.ask()[0].trajectories)])
     resumed = runs.resume(tmp_path / "stopped", env=Corridor()).run(ReturnExpert())
     assert fingerprint(resumed) == fingerprint(learner)

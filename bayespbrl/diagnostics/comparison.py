@@ -109,9 +109,8 @@ def _table(
     elpd = log_probability.sum(axis=1)
     order = np.argsort(-elpd, kind="stable")
     with np.errstate(invalid="ignore"):  # both −∞: neither is better
-        behind = np.where(
-            log_probability == log_probability[order[0]], 0.0, log_probability - log_probability[order[0]]
-        )
+        best = log_probability[order[0]]
+        behind = np.where(log_probability == best, 0.0, log_probability - best)
     values = {
         "elpd": elpd,
         "standard_error": _error_of_sum(log_probability, groups),

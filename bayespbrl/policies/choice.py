@@ -93,13 +93,12 @@ def fitting(policy: Policy, observation_space: Space[Any], action_space: Space[A
         if isinstance(action_space, Discrete) != is_discrete(policy):
             got: object = f"actions that are {'' if is_discrete(policy) else 'not '}discrete"
         elif is_discrete(policy):
-            got = np.asarray(policy.probabilities(observation[None])).shape
+            chances = np.asarray(policy.probabilities(observation[None]))
+            got = chances.shape
+            if got == expected and not (np.all(chances >= 0) and np.isclose(chances.sum(), 1, atol=1e-3)):
+                raise ValueError(f"probabilities {checks.shortened(chances[0].tolist())}")
         else:
             got = np.asarray(policy.sample(jax.random.key(0), observation)).shape
-        if got == expected and is_discrete(policy):
-            chances = np.asarray(policy.probabilities(observation[None]))
-            if not (np.all(chances >= 0) and np.isclose(chances.sum(), 1, atol=1e-3)):
-                raise ValueError(f"probabilities {checks.shortened(chances[0].tolist())}")
         if got == expected:  # what the first update needs
             if not is_pytree(policy):
                 raise ValueError("one that is no JAX pytree of arrays")
