@@ -1,8 +1,8 @@
 """Checks of arguments, one for each kind: a `ValueError` says which argument it is, what was expected and what came."""
 
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -69,6 +69,18 @@ def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
     return str(value)
+
+
+Choice = TypeVar("Choice")
+
+
+def function_or_name(option: str, given: Choice | str | None, name: str, known: Mapping[str, Choice]) -> Choice:
+    """The user's own function where `given` is one, else the known one with the name that the settings have."""
+    if given is not None and not isinstance(given, str):
+        return given
+    if name not in known:
+        raise ValueError(f"{option}: expected a function, because the settings say {name!r}, got none")
+    return known[name]
 
 
 LONGEST_NAME = 64

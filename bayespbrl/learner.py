@@ -1,13 +1,14 @@
 """The learner: asks, takes answers, and moves through the cycle in between."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 
-from bayespbrl import checks, events, queries
+from bayespbrl import checks, events, questions
+from bayespbrl import queries as query_rules
 from bayespbrl.cycle import Cycle
 from bayespbrl.envs import opening
 from bayespbrl.envs.opening import AnyEnvironment
@@ -56,7 +57,7 @@ class Learner:
         features: StateFeatures | None = None,
         policy: Policy | str | None = None,
         schedule: schedules.Schedule | str | None = None,
-        query: queries.QueryRule | str | None = None,
+        query: query_rules.QueryRule | str | None = None,
         entries: Iterable[Entry] = (),
         kept: Settings | None = None,
         **options: Any,
@@ -95,8 +96,8 @@ class Learner:
             self.settings,
             self.environment,
             FeatureSource(*spaces, period, features),
-            _chosen("schedule", schedule, self.settings.update.schedule, schedules.SCHEDULES),
-            _chosen("query", query, self.settings.questions.query, queries.QUERY_RULES),
+            checks.function_or_name("schedule", schedule, self.settings.update.schedule, schedules.SCHEDULES),
+            checks.function_or_name("query", query, self.settings.questions.query, query_rules.QUERY_RULES),
         )
         self.log: Log | None = None
         self.own_policy = None if own_policy is None else fitting(own_policy, *spaces)
@@ -198,23 +199,33 @@ class Learner:
         return self.state.waiting(self.settings)
 
     def tell(
-        self, answers: Sequence[Answer | str], *, answerer: str | None = None, seconds: float | None = None
+        self,
+        answers: Sequence[Answer | str],
+        *,
+        queries: Sequence[Query] | None = None,
+        answerer: str | None = None,
+        seconds: float | None = None,
     ) -> None:
         """Take in the answer to the question that waits, and move on as far as possible without another.
 
         Args:
           answers: one, to the question that `ask` returned.
+          queries: the questions that are answered, as `ask` returned them; None: those that wait now, which nobody need
+            have seen. Where several people or programs answer, these keep an answer from another's question.
           answerer: name of who gave it, whom `ask` was told; at most 64 characters. Each of several has a lapse rate.
           seconds: how long they took, which is kept beside the answer.
 
         Raises:
-          ValueError: an answer that is none, not as many answers as questions, or a bad name or time; nothing has
-            happened then. Or what follows the answer fails, as the environment may: the answer is kept, and `ask` tries
-            again.
+          ValueError: an answer that is none, not as many answers as questions, a question that no longer waits, or a
+            bad name or time; nothing has happened then. Or what follows the answer fails, as the environment may: the
+            answer is kept, and `ask` tries again.
         """
         waiting = self.state.waiting(self.settings, answerer)
-        one = answerer is not None and isinstance(answers, Sequence) and len(answers) == 1
-        self._take_in(waiting[:1] if one else waiting, answers, answerer, seconds)
+        if queries is not None:
+            queries = questions.still_waiting(queries, waiting)
+        elif answerer is not None and isinstance(answers, Sequence) and len(answers) == 1:
+            queries = waiting[:1]
+        self._take_in(waiting if queries is None else queries, answers, answerer, seconds)
         self._advance()
 
     def _take_in(
@@ -336,15 +347,3 @@ class Learner:
         if self.log is not None:
             self.log.append(entry, state)
         self.state = state
-
-
-Choice = TypeVar("Choice")
-
-
-def _chosen(option: str, given: Choice | str | None, name: str, known: Mapping[str, Choice]) -> Choice:
-    """The schedule or query rule: the user's own, or the known one of that name."""
-    if given is not None and not isinstance(given, str):
-        return given
-    if name not in known:
-        raise ValueError(f"{option}: expected a function, because the settings say {name!r}, got none")
-    return known[name]

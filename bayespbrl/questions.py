@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayespbrl import checks
-from bayespbrl.preferences import Answer, PastQuestion, Preferences
+from bayespbrl.preferences import Answer, PastQuestion, Preferences, Query
 from bayespbrl.queries import QUERY_RULES, QueryRule, QuerySituation, candidates, random_candidates
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
@@ -169,3 +169,23 @@ def repeated(
         if options.shared_repeats or each.answerer == person
     ]
     return suitable[rng.integers(len(suitable))] if suitable else None
+
+
+def still_waiting(queries: Sequence[Query], waiting: Sequence[Query]) -> list[Query]:
+    """Those of the `waiting` questions that are the given ones, in the order of these.
+
+    Raises:
+      ValueError: one that is no question, is given twice, or does not wait: it was answered, or taken back.
+    """
+    known = {(query.number, query.first, query.second): query for query in waiting}
+    found = []
+    for query in queries:
+        if not isinstance(query, Query):
+            raise ValueError(f"queries: expected questions as ask() returned them, got {query!r}"[:200])
+        if (query.number, query.first, query.second) not in known:
+            raise ValueError(
+                f"queries: expected questions that wait for an answer, each once, got number {query.number}, "
+                f"where {', '.join(str(other.number) for other in waiting) or 'none'} waits"
+            )
+        found.append(known.pop((query.number, query.first, query.second)))
+    return found

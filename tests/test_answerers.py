@@ -266,8 +266,10 @@ def test_an_answer_to_a_question_that_waits_for_another_person_is_refused():
         run.tell(["first"], answerer="Ben")
     (query,) = run.ask(answerer="Ben")
     assert query.repeats is None
-    assert len(run.ask()) == 2
-    run.tell(["second"], answerer="Ben")
+    repeated, _ = run.ask()
+    with pytest.raises(ValueError, match=rf"got number {repeated.number}, where {query.number} waits"):
+        run.tell(["second"], queries=[repeated], answerer="Ben")
+    run.tell(["second"], queries=[query], answerer="Ben")
     assert run.state.past[-1].number == query.number
     assert run.ask(answerer="Ada")[0].repeats is not None
     with pytest.raises(ValueError, match="answerer: expected"):

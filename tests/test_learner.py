@@ -377,6 +377,35 @@ def test_a_person_takes_no_answer_of_another_back():
     assert [past.answerer for past in run.state.past][:2] == ["Ada", "Bob"]
 
 
+def test_an_answer_to_a_question_that_no_longer_waits_is_refused_and_to_one_that_does_is_taken_in():
+    run = learner()
+    (seen,) = run.ask()
+    run.tell(["first"], queries=[seen], answerer="Ada")
+    (present,) = run.ask()
+    with pytest.raises(ValueError, match=f"got number {seen.number}, where {present.number} waits"):
+        run.tell(["second"], queries=[seen], answerer="Bob")
+    with pytest.raises(ValueError, match="each once"):
+        run.tell(["first", "first"], queries=[present, present])
+    with pytest.raises(ValueError, match="expected questions as ask"):
+        run.tell(["first"], queries=["first"])
+    run.tell(["second"], queries=[present], answerer="Bob")
+    assert [(past.number, past.answerer) for past in run.state.past] == [(seen.number, "Ada"), (present.number, "Bob")]
+
+
+def test_a_question_whose_number_was_given_to_another_after_an_undo_is_refused():
+    run = learner(first_queries=2)
+    run.ask()
+    run.tell(["first"])
+    (stale,) = run.ask()
+    run.undo()
+    run.tell(["second"])
+    (present,) = run.ask()
+    assert present.number == stale.number
+    assert (present.first, present.second) != (stale.first, stale.second)
+    with pytest.raises(ValueError, match="expected questions that wait"):
+        run.tell(["first"], queries=[stale])
+
+
 def test_the_last_answers_can_be_undone_and_no_more_are_held_in_memory(monkeypatch):
     monkeypatch.setattr(events.fold, "MOST_UNDONE", 2)
     run = learner(first_queries=5)
