@@ -159,6 +159,13 @@ def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
     assert one.answers == Comparisons.among(trajectories, pairs, discount=1.0).answers
 
 
+def test_a_missing_name_as_tables_have_it_is_refused_and_names_of_any_sequence_are_taken():
+    with pytest.raises(ValueError, match="expected 3 names, one for each answer and '' for a person without"):
+        Answers(answerers=["Ada", float("nan"), "Ben"]).checked(3)
+    for names in (("Ada", "", "Ben"), np.array(["Ada", "", "Ben"])):
+        assert Answers(answerers=names).checked(3).names == ("Ada", "", "Ben")
+
+
 def test_names_without_who_gave_which_answer_are_refused():
     with pytest.raises(ValueError, match="answerers: expected who of Ada gave each answer, got None"):
         posterior_draws(np.ones((2, 1)), PreferenceModel(), seed=0, answers=Answers(names=("Ada",)))

@@ -103,7 +103,9 @@ class Answers:
         """The same as arrays; `ValueError` where one is not of shape (`number`,) or not of its kind."""
         tied, sides, who, names = self.indifferent, self.shown_first, self.answerers, self.names
         if who is not None:
-            who, names = _numbered(np.asarray(who), names, number)
+            given = np.asarray(who)  # of names and a NaN it makes names, "nan" among them
+            given = np.asarray(who, dtype=object) if given.dtype.kind == "U" else given
+            who, names = _numbered(given, names, number)
         elif names is not None and number:
             raise ValueError(f"answerers: expected who of {', '.join(names)} gave each answer, got None")
         return Answers(
