@@ -3,22 +3,31 @@
     python benchmarks/gridworld_rewards.py normal --out runs/normal      # standard normal, as the prior
     python benchmarks/gridworld_rewards.py permuted --out runs/permuted  # the domain's own, shuffled in each trial
     python benchmarks/gridworld_rewards.py own --out runs/own            # the domain's own
-    python benchmarks/calibration.py runs/normal runs/permuted runs/own
 
-A trial is a run of at most 12 answers by an expert who prefers the higher sum of rewards; the dynamics are the
-Gridworld's. Repeated, a command runs the trials that are missing.
+A trial is a run of at most 12 answers by an expert who prefers the higher sum of rewards, without an error; the
+dynamics are the Gridworld's. In the end each answer is predicted, from the ordered pairs before it, by three models:
+that of the run; without lapses; and without lapses and with a steepness at which nearly no answer is an error.
+`python benchmarks/calibration.py runs/normal` scores what the runs themselves predicted.
+
+Repeated, a command runs the trials that are missing.
 """
 
 import argparse
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 import bayespbrl
+from bayespbrl.diagnostics import answer_probabilities
 from bayespbrl.envs.gridworld import REWARDS
-from bayespbrl.trajectories import Trajectory
+from bayespbrl.results.tables import calibration_line, markdown
+from bayespbrl.trajectories import Trajectory, trajectory_features
+from bayespbrl.utility import PosteriorUtility
 
 KINDS = ("own", "permuted", "normal")
+# lapse rate and steepness, None where they are inferred
+MODELS = {"as the run": (None, None), "without lapses": (0.0, None), "without errors": (0.0, 100.0)}
 
 
 def rewards_of(kind: str, seed: int) -> np.ndarray:
@@ -44,17 +53,57 @@ def trial(kind: str, seed: int, directory: Path) -> None:
     learner.run(expert)
 
 
+def one_hot(states: np.ndarray) -> np.ndarray:
+    """φ of cells, as the learner has it."""
+    return np.eye(REWARDS.size)[states]
+
+
+def predicted(directory: Path) -> pd.DataFrame:
+    """A row for each ordered answer after the first iteration: how probable each model held what the expert said."""
+    run = bayespbrl.load(directory)
+    sums = trajectory_features(run.trajectories, one_hot, discount=run.settings.trajectory_discount)
+    pairs = [
+        (past.preferred, past.first + past.second - past.preferred)
+        for past in run.learner.state.past
+        if past.preferred is not None
+    ]
+    rows = []
+    for number in range(run.iterations[0]["answers"], len(pairs)):
+        preferred, other = pairs[number]
+        row = {}
+        for name, (lapse_rate, steepness) in MODELS.items():
+            utility = bayespbrl.infer_utility(
+                sums, pairs[:number], seed=number, lapse_rate=lapse_rate, steepness=steepness
+            )
+            assert isinstance(utility, PosteriorUtility)
+            assert utility.posterior is not None
+            difference = (sums[preferred] - sums[other]) / utility.scales
+            either = answer_probabilities(utility.posterior, difference[None])[0, :2]
+            row[name] = either[0] / either.sum()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
 def main() -> None:
-    """Run the trials, and print a line when each has ended."""
+    """Run the trials, and print a line when each has ended, and in the end the calibration by each model."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rewards", choices=KINDS)
     parser.add_argument("--trials", type=int, default=20)
     parser.add_argument("--seed", type=int, default=150, help="of the first trial")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
+    found = []
     for seed in range(arguments.seed, arguments.seed + arguments.trials):
         trial(arguments.rewards, seed, arguments.out / f"seed-{seed}")
+        found.append(predicted(arguments.out / f"seed-{seed}"))
         print(f"{arguments.rewards}: seed {seed} ended", flush=True)
+    table = pd.concat(found)
+    lines = [
+        {"rewards": arguments.rewards, "model": name, "runs": str(len(found))}
+        | calibration_line(np.clip(table[name], 0, 1), np.ones(len(table), bool))
+        for name in MODELS
+    ]
+    print(markdown(pd.DataFrame(lines)))
 
 
 if __name__ == "__main__":
