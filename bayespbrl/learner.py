@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 
 from bayespbrl import checks, events, questions
-from bayespbrl import queries as query_rules
 from bayespbrl.cycle import Cycle
 from bayespbrl.envs import opening
 from bayespbrl.envs.opening import AnyEnvironment
@@ -19,6 +18,7 @@ from bayespbrl.improvement import schedules
 from bayespbrl.policies import Policy, Sampler, greedy
 from bayespbrl.policies.choice import expected_policy, fitting, initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
+from bayespbrl.queries import QUERY_RULES, QueryRule
 from bayespbrl.settings import Settings, Task, settings_for
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
@@ -57,7 +57,7 @@ class Learner:
         features: StateFeatures | None = None,
         policy: Policy | str | None = None,
         schedule: schedules.Schedule | str | None = None,
-        query: query_rules.QueryRule | str | None = None,
+        query: QueryRule | str | None = None,
         entries: Iterable[Entry] = (),
         kept: Settings | None = None,
         **options: Any,
@@ -97,7 +97,7 @@ class Learner:
             self.environment,
             FeatureSource(*spaces, period, features),
             checks.function_or_name("schedule", schedule, self.settings.update.schedule, schedules.SCHEDULES),
-            checks.function_or_name("query", query, self.settings.questions.query, query_rules.QUERY_RULES),
+            checks.function_or_name("query", query, self.settings.questions.query, QUERY_RULES),
         )
         self.log: Log | None = None
         self.own_policy = None if own_policy is None else fitting(own_policy, *spaces)
@@ -220,12 +220,12 @@ class Learner:
             bad name or time; nothing has happened then. Or what follows the answer fails, as the environment may: the
             answer is kept, and `ask` tries again.
         """
-        waiting = self.state.waiting(self.settings, answerer)
+        answered = self.state.waiting(self.settings, answerer)
         if queries is not None:
-            queries = questions.still_waiting(queries, waiting)
+            answered = questions.still_waiting(queries, answered)
         elif answerer is not None and isinstance(answers, Sequence) and len(answers) == 1:
-            queries = waiting[:1]
-        self._take_in(waiting if queries is None else queries, answers, answerer, seconds)
+            answered = answered[:1]
+        self._take_in(answered, answers, answerer, seconds)
         self._advance()
 
     def _take_in(

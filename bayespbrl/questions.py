@@ -182,10 +182,11 @@ def still_waiting(queries: Sequence[Query], waiting: Sequence[Query]) -> list[Qu
     for query in queries:
         if not isinstance(query, Query):
             raise ValueError(f"queries: expected questions as ask() returned them, got {query!r}"[:200])
-        if (query.number, query.first, query.second) not in known:
+        same = known.pop((query.number, query.first, query.second), None)
+        if same is None:
             raise ValueError(
                 f"queries: expected questions that wait for an answer, each once, got number {query.number}, "
                 f"where {', '.join(str(other.number) for other in waiting) or 'none'} waits"
             )
-        found.append(known.pop((query.number, query.first, query.second)))
+        found.append(same)
     return found
