@@ -13,6 +13,7 @@ Repeated, a command runs the trials that are missing.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ import pandas as pd
 import bayespbrl
 from bayespbrl.diagnostics import answer_probabilities
 from bayespbrl.envs.gridworld import REWARDS
+from bayespbrl.preferences import Answer
 from bayespbrl.results.tables import calibration_line, markdown
 from bayespbrl.trajectories import Trajectory, trajectory_features
 from bayespbrl.utility import PosteriorUtility
@@ -38,19 +40,18 @@ def rewards_of(kind: str, seed: int) -> np.ndarray:
     return rng.permutation(REWARDS.ravel()) if kind == "permuted" else REWARDS.ravel()
 
 
-def trial(kind: str, seed: int, directory: Path) -> None:
+def trial(kind: str, seed: int, directory: Path) -> bayespbrl.Learner:
     """One run, from where it was stopped."""
     rewards = rewards_of(kind, seed)
 
-    def expert(first: Trajectory, second: Trajectory) -> str:
-        returns = [rewards[trajectory.states[1:]].sum() for trajectory in (first, second)]
-        return "tie" if returns[0] == returns[1] else "first" if returns[0] > returns[1] else "second"
+    def expert(*shown: Trajectory) -> Answer:
+        return bayespbrl.ReturnExpert()(*(replace(each, rewards=rewards[each.states[1:]]) for each in shown))
 
     if directory.exists():
         learner = bayespbrl.resume(directory)
     else:
         learner = bayespbrl.start("gridworld", directory, answers=12, seed=seed)
-    learner.run(expert)
+    return learner.run(expert)
 
 
 def one_hot(states: np.ndarray) -> np.ndarray:
@@ -58,17 +59,12 @@ def one_hot(states: np.ndarray) -> np.ndarray:
     return np.eye(REWARDS.size)[states]
 
 
-def predicted(directory: Path) -> pd.DataFrame:
+def predicted(learner: bayespbrl.Learner) -> pd.DataFrame:
     """A row for each ordered answer after the first iteration: how probable each model held what the expert said."""
-    run = bayespbrl.load(directory)
-    sums = trajectory_features(run.trajectories, one_hot, discount=run.settings.trajectory_discount)
-    pairs = [
-        (past.preferred, past.first + past.second - past.preferred)
-        for past in run.learner.state.past
-        if past.preferred is not None
-    ]
+    sums = trajectory_features(learner.trajectories, one_hot, discount=learner.settings.trajectory_discount)
+    pairs = learner.preferences.pairs
     rows = []
-    for number in range(run.iterations[0]["answers"], len(pairs)):
+    for number in range(learner.iterations[0]["answers"], len(pairs)):
         preferred, other = pairs[number]
         row = {}
         for name, (lapse_rate, steepness) in MODELS.items():
@@ -94,8 +90,7 @@ def main() -> None:
     arguments = parser.parse_args()
     found = []
     for seed in range(arguments.seed, arguments.seed + arguments.trials):
-        trial(arguments.rewards, seed, arguments.out / f"seed-{seed}")
-        found.append(predicted(arguments.out / f"seed-{seed}"))
+        found.append(predicted(trial(arguments.rewards, seed, arguments.out / f"seed-{seed}")))
         print(f"{arguments.rewards}: seed {seed} ended", flush=True)
     table = pd.concat(found)
     lines = [
