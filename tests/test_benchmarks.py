@@ -337,3 +337,23 @@ def test_wrong_options_of_the_neighbours_are_one_line(neighbours, tmp_path, monk
         neighbours.main()
     assert refused.value.code == 2
     assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_an_earlier_version_is_compared_pair_by_pair_with_the_policies_that_the_default_kept(tmp_path):
+    study = BENCHMARKS / "studies" / "paper-tasks"
+    kept = pd.read_csv(study / "iterations.csv").query("tasks == 'gridworld' and methods == 'default'")
+    kept = kept.drop_duplicates("seed", keep="last").set_index("seed")["value"].iloc[:6]
+    earlier = pd.DataFrame({"seed": kept.index, "answers": 12, "iterations": 11, "value": kept.to_numpy() - 1.5})
+    earlier.loc[0, "value"] = 10.0
+    others = pd.DataFrame(
+        {"seed": [1], "answers": [12], "iterations": [11], "value": [0.0]}
+    )  # of no trial of the study
+    module = benchmark("earlier_version")
+    file = module.rows_of("gridworld", tmp_path)
+    pd.concat([earlier, others]).assign(with_noise=lambda rows: rows["value"]).to_csv(file, index=False)
+    table = module.table(study, tmp_path)
+    assert table["task"].tolist() == ["gridworld"]  # the SwingUp has no rows of the earlier version
+    assert table["pairs"].tolist() == ["6"]
+    assert table["default − earlier"].str.startswith("1.5 [1.5, ").all()
+    assert table["earlier"].str.endswith(", 1 fail").all()
+    assert table["default"].str.startswith(f"{np.median(kept):.4g} [").all()
