@@ -2,7 +2,7 @@
 
     git worktree add /tmp/earlier 49879bc
     bayespbrl study earlier-version --out runs/earlier-version
-    python benchmarks/earlier_version.py --checkout /tmp/earlier --jobs 2
+    python benchmarks/earlier_version.py --checkout /tmp/earlier --jobs 2 --study runs/earlier-version
     python benchmarks/earlier_version.py   # the table, from the committed rows
 
 On the paper's four tasks with 12 answers, twenty pairs of trials each: the value of what a version returns, a mean of

@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bayespbrl.diagnostics.axes import number_cells
+from bayespbrl.diagnostics.axes import finished, number_cells
 from bayespbrl.diagnostics.estimates import expect_estimate
 from bayespbrl.envs.opening import environment_attribute
 from bayespbrl.envs.stepping import of_whole_episodes
@@ -30,9 +30,17 @@ def learning_curve(iterations: Sequence[Mapping[str, Any]], axes: Axes, *, optim
     axes.plot([s["answers"] for s in iterations], [s["value"] for s in iterations], marker="o", markersize=3)
     if optimum is not None:
         axes.axhline(optimum, color="0.5", linestyle="--", linewidth=1)
-        axes.annotate("optimal", (0.02, optimum), xycoords=("axes fraction", "data"), va="bottom", color="0.4")
-    axes.set(xlabel="answers", ylabel="value (mean return)", title="Learning curve")
-    return axes
+        axes.annotate(
+            "optimal",
+            (0.98, optimum),
+            xycoords=("axes fraction", "data"),
+            xytext=(0, -4),
+            textcoords="offset points",
+            va="top",
+            ha="right",
+            color="0.4",
+        )
+    return finished(axes, xlabel="answers", ylabel="value (mean return)", title="Learning curve")
 
 
 def quartile_curve(quartiles: xr.Dataset, axes: Axes, *, levels: Mapping[str, float] | None = None) -> Axes:
@@ -51,8 +59,7 @@ def quartile_curve(quartiles: xr.Dataset, axes: Axes, *, levels: Mapping[str, fl
     for name, level in (levels or {}).items():
         axes.axhline(level, color="0.5", linestyle="--", linewidth=1)
         axes.annotate(name, (0.98, level), xycoords=("axes fraction", "data"), va="bottom", ha="right", color="0.4")
-    axes.set(xlabel="answers", ylabel="value (mean return)")
-    axes.legend(loc="lower right")
+    finished(axes, xlabel="answers", ylabel="value (mean return)").legend(loc="lower right")
     return axes
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from bayespbrl.diagnostics.axes import finished
 from bayespbrl.figures import new_figure
 from bayespbrl.results.intervals import performance_profile
 from bayespbrl.results.study_data import StudyData
@@ -23,8 +24,7 @@ def curves_figure(data: StudyData) -> Figure:
             low, middle, high = np.quantile(row.values, [0.25, 0.5, 0.75], axis=0)
             (line,) = axes.plot(row.answers, middle, label=name or "median")
             axes.fill_between(row.answers, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
-        axes.set(xlabel="answers", ylabel="value", title=task)
-        axes.legend(fontsize="x-small")
+        finished(axes, xlabel="answers", ylabel="value", title=task).legend(fontsize="x-small")
     return figure
 
 
