@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, random
+from jax import Array, lax, random
 from jax.scipy.special import logsumexp
 from jaxtyping import Bool, Float, PRNGKeyArray
 
@@ -27,7 +27,12 @@ from bayespbrl.models.refraction import Walls, flight_move, walls_of
 
 # Dimensions from which few answers decide about each, so that the lapse rate takes the weights along.
 MANY_DIMENSIONS = 64
+# Flights of a draw there: the number of violated answers changes little in each.
+FLIGHTS = 12
 BESIDE = 1e-300  # a margin on one side of the step
+
+
+_InFlight = tuple[Float[Array, " q"], Float[Array, " c"], Bool[Array, ""]]  # y, its margins, whether one was given up
 
 
 class Steps(NamedTuple):
@@ -59,10 +64,10 @@ def steps_of(fits: Sequence[GaussianFit], problem: JointProblem) -> Steps:
 def step_moves(
     key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem, steps: Steps
 ) -> tuple[Float[Array, " q"], Unknowns, Bool[Array, ""]]:
-    """One flight, lapse rates drawn after it and then with the weights.
+    """Flights, lapse rates drawn after them and then with the weights.
 
     Returns:
-      the weights, the unknowns, and whether the flight was given up.
+      the weights, the unknowns, and whether a flight was given up.
     """
     keys, y = random.split(key, 3), z / problem.settings.prior_scale
     walls = at_setting(steps.walls, unknowns.setting)
@@ -73,15 +78,25 @@ def step_moves(
         log_p = jnp.atleast_2d(log_probabilities(problem, every, margins))  # one row where no answer can be a lapse
         return problem.answerers @ log_p.T + problem.lapse_rate.log_probabilities
 
-    y, margins, given_up = flight_move(
-        keys[0],
-        y,
-        walls,
-        margins=margins,
-        violated=problem.answerers @ (margins < 0),
-        heights=steps.heights,
-        log_likelihood=lambda margins: jnp.sum(logsumexp(lapse_weights(margins), axis=1)),
-    )
+    def flight(now: _InFlight, key: PRNGKeyArray) -> tuple[_InFlight, None]:
+        y, margins, given_up = now
+        y, margins, this_given_up = flight_move(
+            key,
+            y,
+            walls,
+            margins=margins,
+            violated=problem.answerers @ (margins < 0),
+            heights=steps.heights,
+            log_likelihood=lambda margins: jnp.sum(logsumexp(lapse_weights(margins), axis=1)),
+        )
+        return (y, margins, given_up | this_given_up), None
+
+    now = (y, margins, jnp.zeros((), bool))
+    if steps.ladder is None:
+        now, _ = flight(now, keys[0])
+    else:
+        now, _ = lax.scan(flight, now, random.split(keys[0], FLIGHTS))
+    y, margins, given_up = now
     if len(problem.lapse_rate.values) > 1:
         unknowns = unknowns._replace(lapse_rate=random.categorical(keys[1], lapse_weights(margins)))
     if steps.ladder is not None:
