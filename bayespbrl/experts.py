@@ -240,7 +240,7 @@ class TerminalExpert:
         while True:
             try:
                 reply = self.read(PROMPT).strip().lower()
-            except EOFError:
+            except (EOFError, RuntimeError):  # the latter without standard input
                 raise KeyboardInterrupt from None
             if reply in ("q", "quit"):
                 raise KeyboardInterrupt

@@ -278,6 +278,7 @@ class Learner:
         """
         if not callable(expert) or isinstance(expert, type):
             raise ValueError(f"expert: expected a function of two trajectories, got {expert!r}")
+        checks.optional(checks.short_name, "answerer", answerer)
         self._advance(progress)
         vain = 0
         while (query := self._question_for(answerer, progress)) is not None:

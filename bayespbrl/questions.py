@@ -4,7 +4,7 @@ In which order trajectories are worth asking about is a query rule's matter (`qu
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -177,6 +177,8 @@ def still_waiting(queries: Sequence[Query], waiting: Sequence[Query]) -> list[Qu
     Raises:
       ValueError: one that is no question, is given twice, or does not wait: it was answered, or taken back.
     """
+    if isinstance(queries, Query) or not isinstance(queries, Iterable):
+        raise ValueError(f"queries: expected a list of questions as ask() returned it, got {queries!r}"[:200])
     known = {(query.number, query.first, query.second): query for query in waiting}
     found = []
     for query in queries:

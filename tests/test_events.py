@@ -128,9 +128,26 @@ def test_a_policy_is_started_anew_once_and_what_was_kept_is_remembered():
         update = improved(3)
         update.event["summary"].update(checked, kept=kept)
         assert apply(state, update).kept_policy == policy
-    for history in ((anew,), (*HISTORY, anew, improved(3), anew)):
+    first, again = (dataclasses.replace(anew, event={**anew.event, "iteration": number}) for number in (1, 4))
+    for history in ((first,), (*HISTORY, anew, improved(3), again)):
         with pytest.raises(ValueError, match="collected: expected at most one restart"):
             replay(START, history)
+
+
+@pytest.mark.parametrize(
+    ("history", "follows"),
+    [
+        ((improved(1),), "collected of iteration 1"),
+        ((collected(2, [0, 1]),), "collected of iteration 1"),
+        ((*HISTORY[:1], HISTORY[0]), "improved of iteration 1"),
+        ((*HISTORY[:5], improved(2)), "improved of iteration 1"),
+        ((*HISTORY[:6], improved(1)), "collected of iteration 2"),
+        ((*HISTORY[:6], collected(1, [4, 3])), "collected of iteration 2"),
+    ],
+)
+def test_an_iteration_that_took_place_or_is_not_the_next_is_refused(history, follows):
+    with pytest.raises(ValueError, match=f"expected {follows}, got"):
+        replay(START, history)
 
 
 @pytest.mark.parametrize("length", range(3, len(HISTORY) + 1))

@@ -132,7 +132,7 @@ def test_a_person_who_types_nonsense_is_asked_again(tmp_path, capsys):
     assert capsys.readouterr().out.count("Expected one of 1, 2, t, s, u, q") == 3
 
 
-@pytest.mark.parametrize("reply", ["q", "quit", "Q", EOFError, KeyboardInterrupt])
+@pytest.mark.parametrize("reply", ["q", "quit", "Q", EOFError, KeyboardInterrupt, RuntimeError])
 def test_a_person_can_stop(tmp_path, reply):
     with pytest.raises(KeyboardInterrupt):
         person(tmp_path, reply)(trajectory([0.0]), trajectory([1.0]))

@@ -388,8 +388,18 @@ def test_an_answer_to_a_question_that_no_longer_waits_is_refused_and_to_one_that
         run.tell(["first", "first"], queries=[present, present])
     with pytest.raises(ValueError, match="expected questions as ask"):
         run.tell(["first"], queries=["first"])
+    for one in (present, 1):
+        with pytest.raises(ValueError, match="queries: expected a list of questions as ask"):
+            run.tell(["first"], queries=one)
     run.tell(["second"], queries=[present], answerer="Bob")
     assert [(past.number, past.answerer) for past in run.state.past] == [(seen.number, "Ada"), (present.number, "Bob")]
+
+
+def test_a_bad_name_is_refused_before_a_person_is_asked():
+    run, asked = learner(), []
+    with pytest.raises(ValueError, match="answerer: expected"):
+        run.run(lambda *shown: asked.append(shown) or "first", answerer="Ada ")
+    assert (asked, run.trajectories) == ([], ())
 
 
 def test_a_question_whose_number_was_given_to_another_after_an_undo_is_refused():

@@ -242,7 +242,7 @@ def test_a_place_that_may_not_be_looked_at_is_refused(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("what", ["drop_partial_line", "write_summary"])
+@pytest.mark.parametrize("what", ["take_over", "write_summary"])
 def test_a_run_that_cannot_be_written_is_not_resumed_but_loaded(copy, monkeypatch, what):
     denied = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
     monkeypatch.setattr(RunDirectory, what, denied)
@@ -255,7 +255,7 @@ def test_a_run_that_cannot_be_written_is_not_resumed_but_loaded(copy, monkeypatc
 
 def test_a_log_that_cannot_be_read_is_named(copy, monkeypatch):
     denied = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
-    monkeypatch.setattr(run_directory, "read_log_lines", denied)
+    monkeypatch.setattr(run_directory, "_content", denied)
     with pytest.raises(ValueError, match=r"copy: events\.jsonl: expected a log that can be read, got .*denied"):
         bayespbrl.load(copy)
 
@@ -594,6 +594,43 @@ def test_a_foreign_line_in_the_log_is_refused(copy, line):
         with pytest.raises(ValueError, match=r"copy: (events\.jsonl, line 3: expected an event|.*expected)"):
             read(copy)
     assert contents(copy) == before
+
+
+@pytest.mark.parametrize("cut_off", [False, True])
+def test_a_run_to_which_another_learner_writes_while_it_is_read_is_not_resumed(tmp_path, cut_off):
+    learner = start(tmp_path / "run")
+    learner.ask()
+    log = learner.log.log_file
+    if cut_off:
+        with log.open("ab") as file:
+            file.write(b'{"event": "answ')
+    late = RunDirectory.open(tmp_path / "run")
+    assert [entry.event["event"] for entry in late.entries()] == ["collected", "asked"]
+    runs.resume(tmp_path / "run").tell(["first"])
+    with log.open("ab") as file:
+        file.write(b'{"event": "impr')  # that one is writing on
+    before = contents(tmp_path / "run")
+    with pytest.raises(ValueError, match="run: expected the run as this learner left it, got events that another"):
+        late.take_over()
+    assert contents(tmp_path / "run") == before
+
+
+def test_runs_that_begin_in_one_second_have_directories_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = start(tmp_path / "run").settings
+    made = [RunDirectory.create_fresh(settings).path for _ in range(4)]
+    assert len(set(made)) == 4
+    taken, create = [], RunDirectory.create.__func__
+
+    def overtaken(cls, path, settings):  # by another process, after the name was chosen
+        if not taken:
+            taken.append(create(cls, path, settings))
+        return create(cls, path, settings)
+
+    monkeypatch.setattr(RunDirectory, "create", classmethod(overtaken))
+    other = RunDirectory.create_fresh(settings).path
+    assert other != taken[0].path
+    assert (other.parent, other.exists(), taken[0].path.exists()) == (tmp_path / "runs", True, True)
 
 
 def test_each_line_of_a_log_is_an_event_or_says_what_stands_there_instead(tmp_path):

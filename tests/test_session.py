@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 import webbrowser
 from unittest import mock
@@ -877,6 +878,48 @@ def test_a_widget_holds_the_run_until_it_is_closed(monkeypatch, capsys, director
     assert not held(directory)
 
 
+def test_a_widget_stays_open_where_another_is_refused(directory):
+    outdated, learner = bayespbrl.resume(directory), bayespbrl.resume(directory)
+    widget = learner.widget(practice=False)
+    try:
+        for number in (1, 2):
+            widget.session.answer(widget.session.wait(timeout=WAIT)["turn"], "first")
+            for other, options, said in (
+                (learner, {"answers": 0}, "answers: expected"),
+                (outdated, {}, "events that another learner has written"),
+            ):
+                with pytest.raises(ValueError, match=said):
+                    other.widget(**options)
+            assert (held(directory), learner.preferences.answers) == (True, number)
+    finally:
+        widget.close()
+
+
+def test_a_step_that_is_computed_while_the_session_closes_is_left_to_the_next(directory):
+    learner = bayespbrl.resume(directory)
+    session, begun, go_on = Session(learner), threading.Event(), threading.Event()
+    compute = session._foresight.compute
+
+    def slowly(moment):
+        begun.set()
+        assert go_on.wait(WAIT)
+        return compute(moment)
+
+    session._foresight.compute = slowly
+    session.open()
+    assert begun.wait(WAIT)
+    before = (directory / "events.jsonl").read_bytes() if (directory / "events.jsonl").exists() else b""
+    closing = threading.Thread(target=session.close)
+    closing.start()
+    while not session._closing:
+        time.sleep(0.01)
+    go_on.set()
+    closing.join(WAIT)
+    assert ((directory / "events.jsonl").read_bytes() if before else b"") == before
+    (next_one,) = bayespbrl.resume(directory).ask()
+    assert next_one.number == 1
+
+
 def held(directory):
     """Whether somebody continues a run."""
     try:
@@ -957,6 +1000,7 @@ def test_a_run_that_nobody_can_be_asked_about_is_refused(monkeypatch, capsys, di
         (["--port", "65536"], "port: expected a number from 0 to 65535, got 65536"),
         (["--host", "192.0.2.1"], "expected an address to listen on, got '192.0.2.1' and 0"),  # another machine's
         (["--host", ""], "expected an address to listen on, got '' and 0"),
+        (["--host", "a..b"], "expected an address to listen on, got 'a..b' and 0"),
     ],
 )
 def test_bad_options_of_ask_are_refused(monkeypatch, capsys, directory, options, named):

@@ -1,6 +1,7 @@
 """The command line: `bayespbrl run`, `resume`, `ask`, `report`, `trials`, `study`, `results`."""
 
 import inspect
+import shutil
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -33,7 +34,7 @@ from bayespbrl.models.likelihoods import LIKELIHOODS
 from bayespbrl.policies.choice import POLICIES
 from bayespbrl.queries import QUERY_RULES
 from bayespbrl.runs import run as runs
-from bayespbrl.runs.directory import fresh_directory
+from bayespbrl.runs.directory import RunDirectory
 from bayespbrl.runs.lock import continuing
 from bayespbrl.settings import OPTIONS, PARTS, Settings
 from bayespbrl.settings.presets import DEFAULT
@@ -168,11 +169,17 @@ def run(
             raise ValueError(
                 f"{name}: expected --no-{name} only with the expert page, got the expert {expert or 'return'}"
             )
-    directory = out or fresh_directory(env)
-    learner = runs.start(env, directory, seed=seed, **options)
+    learner = runs.start(env, out, seed=seed, **options)
+    assert isinstance(learner.log, RunDirectory)
+    directory = out or learner.log.path.relative_to(Path.cwd())
     with continuing(directory):
         place = Place(browser=browser)
-        run_to_the_end(learner, directory, answerers=answerer or [], practice=practice, place=place)
+        try:
+            run_to_the_end(learner, directory, answerers=answerer or [], practice=practice, place=place)
+        except ValueError:  # no simulated expert can be made where all returns are equal, say
+            if not learner.trajectories:
+                shutil.rmtree(directory)
+            raise
 
 
 @app.command()

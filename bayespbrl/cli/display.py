@@ -1,7 +1,6 @@
 """What the command line shows: progress, tables and pictures of runs and studies, and questions to a person."""
 
 import shlex
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -52,16 +51,17 @@ def run_to_the_end(
             person = _person(learner, directory)
             learner.run(person, answerer=next(iter(answerers), None), progress=lambda now: console.print(_state(now)))
         else:
-            _run_with_bar(learner, _simulated(learner, directory))
+            _run_with_bar(learner, expert_of(learner))
         show_run(learner, directory)
     except KeyboardInterrupt:
-        console.print(f"\nStopped. Nothing is lost: {_again('resume', directory, answerers)}")
+        console.print(f"\nStopped. Nothing is lost: {_again('resume', learner, directory, answerers)}")
         raise
 
 
-def _again(command: str, directory: Path, answerers: Sequence[str]) -> str:
+def _again(command: str, learner: Learner, directory: Path, answerers: Sequence[str]) -> str:
     """The command that continues a run, for the same people."""
-    return shlex.join(["bayespbrl", command, str(directory), *(f"--answerer={name}" for name in answerers)])
+    options = [*(f"--answerer={name}" for name in answerers), *["--import-package"] * (":" in learner.settings.env)]
+    return shlex.join(["bayespbrl", command, str(directory), *options])
 
 
 def ask_on_page(
@@ -89,7 +89,7 @@ def ask_on_page(
     from bayespbrl.people.page import Page
     from bayespbrl.people.session import Session
 
-    again = _again("ask", directory, answerers)
+    again = _again("ask", learner, directory, answerers)
     session = Session(learner, most_answers=answers, answerer=answerers or None, practice=practice)
     page = Page(session, host=place.host, port=place.port)
     console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:")
@@ -160,16 +160,6 @@ def _film(learner: Learner, directory: Path) -> str:
     except ValueError as error:
         return f"No film of the final policy: {error}"
     return f"Final policy: {film} and {strip}"
-
-
-def _simulated(learner: Learner, directory: Path) -> Expert:
-    """The simulated expert; where none can be made, as of returns that are all equal, an empty run is removed."""
-    try:
-        return expert_of(learner)
-    except ValueError:
-        if not learner.state.iteration and not learner.state.queries:
-            shutil.rmtree(directory)
-        raise
 
 
 def _run_with_bar(learner: Learner, expert: Expert) -> None:

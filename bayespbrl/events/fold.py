@@ -60,7 +60,7 @@ def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
 def _improved(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:
     if not has_figures(event["summary"]):
         raise ValueError(f"improved: expected a summary with answers and value, got {str(event['summary'])[:60]}")
-    iteration, found = operator.index(event["iteration"]), event if "bound" in event else _by_summary(event["summary"])
+    iteration, found = _next_iteration(state, event), event if "bound" in event else _by_summary(event["summary"])
     check = found["check"]  # of a checked update
     best = iteration if check is None else operator.index(check["best"])
     kept = best if found["kept"] is None else operator.index(found["kept"])
@@ -89,6 +89,15 @@ def _improved(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str,
     )
 
 
+def _next_iteration(state: LearnerState, event: Mapping[str, Any]) -> int:
+    """The iteration of an event `collected` or `improved`; `ValueError` where that cannot follow."""
+    iteration, collected = operator.index(event["iteration"]), event["event"] == "improved"
+    if iteration != state.iteration + 1 or state.collected != collected:
+        follows = f"{'improved' if state.collected else 'collected'} of iteration {state.iteration + 1}"
+        raise ValueError(f"{event['event']}: expected {follows}, got {event['event']} of iteration {iteration}")
+    return iteration
+
+
 def _by_summary(summary: Mapping[str, Any]) -> Mapping[str, Any]:
     """What `improved` has beside its summary, for a log of earlier versions, where only the summary has it."""
     figures = {name: value for name, value in summary["schedule"].items() if name not in ("reason", "signal")}
@@ -99,6 +108,7 @@ def _by_summary(summary: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str, Any]) -> LearnerState:
+    _next_iteration(state, event)
     candidates, preferences = tuple(event["candidates"]), state.preferences
     opponents = event.get("opponents")
     if not preferences.undominated and opponents is None:

@@ -77,7 +77,7 @@ class Page:
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, port), family=family)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # a name with an empty part
             raise ValueError(
                 f"host, port: expected an address to listen on, got {host!r} and {port} ({error})"
             ) from error

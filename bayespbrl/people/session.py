@@ -106,7 +106,7 @@ class Session:
         return self
 
     def close(self) -> None:
-        """Stop after the step of the cycle that is being computed. Nothing is lost."""
+        """Stop after the step of the cycle that is being computed, which may be computed again. No answer is lost."""
         with self.changed:
             self._closing = True
             self.changed.notify_all()
@@ -218,7 +218,9 @@ class Session:
             try:
                 entry = self._foresight.compute(moment)
                 with self.changed:
-                    self._keep(moment, entry)
+                    # computed again in the same way, unless the environment goes by its earlier episodes
+                    if not self._closing or self.learner.comparable_starts is False:
+                        self._keep(moment, entry)
             except Exception as error:  # the environment's, or a full disk
                 with self.changed:
                     self._failed(moment, error)

@@ -42,6 +42,9 @@ class ComparisonWidget(anywidget.AnyWidget):
     def __init__(self, learner: Learner, **options: Any):
         """`options` are those of `Session`, for one person."""
         checks.optional(checks.short_name, "answerer", options.get("answerer"))
+        Session(learner, **options)  # what is refused leaves an earlier widget open
+        if isinstance(learner.log, RunDirectory):
+            learner.log.check_newest()
         for earlier in [widget for widget in OPEN if _same_run(widget.session.learner, learner)]:
             earlier.close()
         with ExitStack() as held:  # let go of where anything is refused

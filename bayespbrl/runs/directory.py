@@ -35,7 +35,8 @@ class RunDirectory:
     def __init__(self, path: Path, settings: Settings):
         self.path = path.absolute()  # a notebook may change its directory
         self.settings = settings
-        self._end: int | None = None  # size of the log, in bytes, after this learner's last event
+        self._read = 0  # size of the log, in bytes, as far as `entries` has read it
+        self._end: int | None = None  # and after this learner's last event
 
     @classmethod
     def create(cls, path: Path | str, settings: Settings) -> "RunDirectory":
@@ -69,6 +70,19 @@ class RunDirectory:
         made = cls(path, settings)
         made._end = 0
         return made
+
+    @classmethod
+    def create_fresh(cls, settings: Settings) -> "RunDirectory":
+        """A new run directory under `runs/`, named after the environment and the time; errors as of `create`."""
+        stem = f"{settings.env.replace('/', '-').lower()}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
+        for number in count(1):
+            path = Path("runs") / (stem if number == 1 else f"{stem}-{number}")
+            try:
+                return cls.create(path, settings)
+            except ValueError:
+                if not path.exists():  # else another run has it, which may have begun in the same second
+                    raise
+        raise AssertionError("unreachable")
 
     @classmethod
     def open(cls, path: Path | str) -> "RunDirectory":
@@ -150,7 +164,9 @@ class RunDirectory:
           features: φ(s) of the user's, where the run was started with it.
           known: classes of the user's that the files may name.
         """
-        for event in surviving(self._events()):
+        content = self._log()
+        self._read = content.rfind(b"\n") + 1
+        for event in surviving(_events(content)):
             parts = {}
             if event["event"] in HEAVY:
                 parts = read_iteration(
@@ -158,17 +174,11 @@ class RunDirectory:
                 )
             yield Entry(event, parts)
 
-    def _events(self) -> Iterator[Event]:
+    def _log(self) -> bytes:
         try:
-            lines = read_log_lines(self.log_file)
+            return _content(self.log_file)
         except OSError as error:
             raise ValueError(f"events.jsonl: expected a log that can be read, got {error}") from error
-        for event in lines:
-            if isinstance(event, PartialLine):
-                return
-            if isinstance(event, ValueError):
-                raise event
-            yield event
 
     def summarised(self) -> int:
         """The number of iterations in `summary.json`; 0 where it cannot be read, since it is derived from the log."""
@@ -191,19 +201,22 @@ class RunDirectory:
         """
         if summarised <= state.iteration + 1:
             return
-        if [event["event"] for event in self._events()][-1:] != ["undone"]:
+        if [event["event"] for event in _events(self._log())][-1:] != ["undone"]:
             raise ValueError(
                 f"events.jsonl: expected the {summarised} completed iterations of summary.json, got {state.iteration}"
             )
 
-    def drop_partial_line(self) -> None:
-        """Cut off a last line that a killed process left half-written, so that the next event starts a new line."""
-        if self.log_file.exists():
-            whole = self.log_file.read_bytes()
-            complete = whole[: whole.rfind(b"\n") + 1]
-            if complete != whole:
-                os.truncate(self.log_file, len(complete))
-        self._end = self._log_size()
+    def take_over(self) -> None:
+        """Continue the log from where `entries` has read it, without a last line that a killed process left cut off.
+
+        Raises:
+          ValueError: another learner has written to the run since; nothing is changed then.
+        """
+        content = _content(self.log_file)
+        self._end = self._read
+        self._check_size(content.rfind(b"\n") + 1)
+        if len(content) > self._end:  # the next event starts a new line
+            os.truncate(self.log_file, self._end)
 
     def _log_size(self) -> int:
         return self.log_file.stat().st_size if self.log_file.exists() else 0
@@ -236,9 +249,25 @@ class PartialLine(ValueError):
 
 def read_log_lines(file: Path) -> list[Event | ValueError]:
     """Each line of a log: an event, or an error with its line number. A missing log has no lines."""
-    if not file.exists():
-        return []
-    *lines, rest = file.read_bytes().split(b"\n")
+    return _lines(_content(file))
+
+
+def _content(file: Path) -> bytes:
+    return file.read_bytes() if file.exists() else b""
+
+
+def _events(content: bytes) -> Iterator[Event]:
+    """The events of a log but for a last line that is cut off; `ValueError` for a line that is no event."""
+    for event in _lines(content):
+        if isinstance(event, PartialLine):
+            return
+        if isinstance(event, ValueError):
+            raise event
+        yield event
+
+
+def _lines(content: bytes) -> list[Event | ValueError]:
+    *lines, rest = content.split(b"\n")
     events = [_event(number, line) for number, line in enumerate(lines, start=1)]
     return events + [PartialLine("events.jsonl: the last line is cut off")] * bool(rest)
 
@@ -295,13 +324,6 @@ def _read_json(file: Path, expected: str) -> Any:
         raise ValueError(f"{expected}, got brackets nested too deeply") from error
     except (OSError, ValueError) as error:
         raise ValueError(f"{expected}, got {error}") from error
-
-
-def fresh_directory(env: str) -> Path:
-    """A path under `runs/` that does not exist yet, named after the environment and the time."""
-    stem = f"{env.replace('/', '-').lower()}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
-    names = (Path("runs") / (stem if number == 1 else f"{stem}-{number}") for number in count(1))
-    return next(path for path in names if not path.exists())
 
 
 def _umask() -> int:

@@ -21,7 +21,7 @@ from bayespbrl.preferences import Preferences
 from bayespbrl.queries import QueryRule, highest_utility
 from bayespbrl.runs.actor import Actor
 from bayespbrl.runs.answers_file import write_answers
-from bayespbrl.runs.directory import RunDirectory, fresh_directory
+from bayespbrl.runs.directory import RunDirectory
 from bayespbrl.runs.stored_classes import classes_of, from_tree, to_tree
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
@@ -47,8 +47,9 @@ def start(
     learner = Learner(env, **options)
     if learner.own_policy is not None:  # better now than after the first answers
         from_tree(to_tree(learner.own_policy), known=classes_of(learner.own_policy))
-    path = fresh_directory(learner.settings.env) if directory is None else directory
-    return learner.logged(RunDirectory.create(path, learner.settings))
+    settings = learner.settings
+    made = RunDirectory.create_fresh(settings) if directory is None else RunDirectory.create(directory, settings)
+    return learner.logged(made)
 
 
 def resume(
@@ -71,12 +72,13 @@ def resume(
 
     Raises:
       ValueError: a package that may not be imported; an environment with other states or actions than the run's; a
-        directory that is no run or cannot be written, or a file in it that is truncated or foreign.
+        directory that is no run or cannot be written, or a file in it that is truncated or foreign; a run to which
+        another learner has written since it was read.
     """
     log = _opened(directory, env, import_package)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
     try:
-        log.drop_partial_line()
+        log.take_over()
         log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
     except OSError as error:
         raise ValueError(f"{log.path}: expected a run that can be written to, got {error}") from error

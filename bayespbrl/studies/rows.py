@@ -82,6 +82,8 @@ class Row:
             done = read_summary(path)["iterations"] if (path / "summary.json").exists() else []
         except ValueError as error:
             raise DamagedTrial(str(error)) from error
+        if not isinstance(done, list) or any(not isinstance(entry, dict) or "pairs" not in entry for entry in done):
+            raise DamagedTrial(f"{path / 'summary.json'}: expected pairs in each iteration, got {str(done)[:60]}")
         if kept.settings != (wanted := replace(self.settings, seed=seed)):
             pairs = zip(kept.settings.options().items(), wanted.options().values(), strict=True)
             others = [f"{name} {kept!r} instead of {here!r}" for (name, kept), here in pairs if kept != here]
@@ -152,7 +154,7 @@ class Seeds:
         """The seeds of unfinished trials, after adding as many new seeds as are needed; none once `exhausted`."""
         while len(self.outcomes) - len(redrawn := self.with_outcome(False)) < self.trials:
             if len(self.outcomes) >= MOST_SEEDS_A_TRIAL * self.trials:
-                self.exhausted = (
+                self.exhausted = self.exhausted or (
                     f"expected {self.trials} trials with a preference within {self.row.preference_within} iterations, "
                     f"got none in {len(redrawn)} of {len(self.outcomes)}"
                 )
