@@ -19,7 +19,7 @@ import xarray as xr
 import bayespbrl
 from bayespbrl.cli.commands import main
 from bayespbrl.cli.compiled import VARIABLE, keep_compiled
-from bayespbrl.cli.display import show_trials
+from bayespbrl.cli.display import _again, show_trials
 from bayespbrl.studies import Trials
 
 SHORT = ["--preset", "paper", "--utility", "linear-program", "--max-steps", "20"]
@@ -167,6 +167,27 @@ def test_nobody_answers_for_an_expert_of_the_users_own(monkeypatch, capsys, tmp_
     before = (tmp_path / "own" / "events.jsonl").read_bytes()
     assert "got other" in refused(monkeypatch, capsys, "resume", tmp_path / "own")
     assert (tmp_path / "own" / "events.jsonl").read_bytes() == before
+
+
+def test_a_run_without_a_simulated_expert_leaves_nothing_behind_but_what_was_there(monkeypatch, capsys, tmp_path):
+    out, options = tmp_path / "run", {"expert": "stochastic", "max_steps": 20}
+    arguments = ["MountainCar-v0", "--expert", "stochastic", "--max-steps", 20, "--out", out]
+    said = refused(monkeypatch, capsys, "run", *arguments)
+    assert not out.exists()
+    bayespbrl.start("MountainCar-v0", out, **options)
+    (out / "notes.txt").write_text("mine")
+    assert refused(monkeypatch, capsys, "resume", out) == said
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_the_command_that_continues_a_run_names_what_it_needs(tmp_path):
+    learner = mock.Mock()
+    learner.settings.env = "package:Env-v0"
+    assert (
+        _again("resume", learner, tmp_path, ["Ada"]) == f"bayespbrl resume {tmp_path} --answerer=Ada --import-package"
+    )
+    learner.settings.env = "Pendulum-v1"
+    assert _again("ask", learner, tmp_path, []) == f"bayespbrl ask {tmp_path}"
 
 
 @pytest.mark.usefixtures("unpictured")

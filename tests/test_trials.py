@@ -254,6 +254,16 @@ def test_a_trial_that_fails_is_named_by_its_seed_and_the_others_are_finished(stu
     assert load(tmp_path / "seed-6").learner.finished
 
 
+@pytest.mark.parametrize("iterations", [[{}], [1], {"1": 2}])
+@pytest.mark.usefixtures("in_this_process")
+def test_a_trial_with_a_foreign_summary_is_named(study, tmp_path, iterations):
+    shutil.copytree(study.path / "seed-5", tmp_path / "seed-5")
+    summary = json.loads((tmp_path / "seed-5" / "summary.json").read_text())
+    (tmp_path / "seed-5" / "summary.json").write_text(json.dumps(summary | {"iterations": iterations}))
+    with pytest.raises(ValueError, match=r"seed-5/summary\.json: expected pairs in each iteration, got"):
+        run_trials("gridworld", tmp_path, seeds=range(5, 6), **QUICK)
+
+
 def test_only_the_acrobot_needs_a_preference_and_within_three_iterations(tmp_path):
     names = ("acrobot", "bayespbrl/Acrobot-v0", "gridworld", "CartPole-v1")
     made = [rows.row_of(env, tmp_path, {}, seed=1000) for env in names]

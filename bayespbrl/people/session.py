@@ -39,6 +39,25 @@ from bayespbrl.preferences import Answer, Query, parse_answer
 GATHER = 1.0  # seconds between two looks at who is here, where there are several
 
 
+Names = str | Sequence[str] | None  # of one person, of several, or none
+
+
+def checked_options(
+    learner: Learner, *, most_answers: int | None = None, answerer: Names = None, practice: bool = False
+) -> list[str | None]:
+    """The names of those who answer; `ValueError` for options that a `Session` does not take."""
+    if learner.finished:
+        raise ValueError("learner: expected a run with questions left, got a finished run")
+    checks.optional(checks.whole, "answers", most_answers)
+    checks.boolean("practice", practice)
+    names: list[str | None] = [answerer] if answerer is None or isinstance(answerer, str) else list(answerer)
+    for name in names:
+        checks.optional(checks.short_name, "answerer", name)
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"answerer: expected a different name for each person, got {names}")
+    return names
+
+
 class Session:
     """A sitting over a learner, safe to call from any thread.
 
@@ -61,22 +80,9 @@ class Session:
     """
 
     def __init__(
-        self,
-        learner: Learner,
-        *,
-        most_answers: int | None = None,
-        answerer: str | Sequence[str] | None = None,
-        practice: bool = False,
+        self, learner: Learner, *, most_answers: int | None = None, answerer: Names = None, practice: bool = False
     ):
-        if learner.finished:
-            raise ValueError("learner: expected a run with questions left, got a finished run")
-        checks.optional(checks.whole, "answers", most_answers)
-        checks.boolean("practice", practice)
-        names = [answerer] if answerer is None or isinstance(answerer, str) else list(answerer)
-        for name in names:
-            checks.optional(checks.short_name, "answerer", name)
-        if not names or len(set(names)) < len(names):
-            raise ValueError(f"answerer: expected a different name for each person, got {names}")
+        names = checked_options(learner, most_answers=most_answers, answerer=answerer, practice=practice)
         self.learner, self.most_answers = learner, most_answers
         self.name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
         self.changed = threading.Condition(threading.RLock())

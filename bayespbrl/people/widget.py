@@ -12,7 +12,7 @@ import traitlets
 
 from bayespbrl import checks
 from bayespbrl.learner import Learner
-from bayespbrl.people.session import Session, answer_of
+from bayespbrl.people.session import Session, answer_of, checked_options
 from bayespbrl.people.views import QUESTION
 from bayespbrl.runs.directory import RunDirectory
 from bayespbrl.runs.lock import continuing
@@ -42,10 +42,12 @@ class ComparisonWidget(anywidget.AnyWidget):
     def __init__(self, learner: Learner, **options: Any):
         """`options` are those of `Session`, for one person."""
         checks.optional(checks.short_name, "answerer", options.get("answerer"))
-        Session(learner, **options)  # what is refused leaves an earlier widget open
-        if isinstance(learner.log, RunDirectory):
+        checked_options(learner, **options)  # what is refused leaves an earlier widget open
+        open_before = [widget for widget in OPEN if _same_run(widget.session.learner, learner)]
+        writing = any(widget.session.learner is learner for widget in open_before)
+        if isinstance(learner.log, RunDirectory) and not writing:
             learner.log.check_newest()
-        for earlier in [widget for widget in OPEN if _same_run(widget.session.learner, learner)]:
+        for earlier in open_before:
             earlier.close()
         with ExitStack() as held:  # let go of where anything is refused
             if isinstance(learner.log, RunDirectory):
