@@ -22,7 +22,7 @@ from bayespbrl import ReturnExpert, load, resume, start
 from bayespbrl.rollouts import returns
 from bayespbrl.studies import Trials, rows, run_trials
 from bayespbrl.studies import trials as trials_module
-from bayespbrl.studies.tables import COLUMNS, collect, write_tables
+from bayespbrl.studies.tables import COLUMNS, collect, collect_first_policies, write_tables
 
 QUICK = SHORT | {"utility": "linear-program", "iterations": 2}
 
@@ -262,6 +262,17 @@ def test_a_trial_with_a_foreign_summary_is_named(study, tmp_path, iterations):
     (tmp_path / "seed-5" / "summary.json").write_text(json.dumps(summary | {"iterations": iterations}))
     with pytest.raises(ValueError, match=r"seed-5/summary\.json: expected pairs in each iteration, got"):
         run_trials("gridworld", tmp_path, seeds=range(5, 6), **QUICK)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"episodes": 3}', '{"value": "high"}'])
+def test_a_foreign_value_of_a_first_policy_is_named(tmp_path, content):
+    (tmp_path / "seed-5").mkdir()
+    file = tmp_path / "seed-5" / "first-policy.json"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=r"first-policy\.json: expected value, got "):
+        collect_first_policies([file.parent], "gridworld")
+    file.write_text('{"value": 2.5}')
+    assert collect_first_policies([file.parent], "gridworld")["value"].item() == 2.5
 
 
 def test_only_the_acrobot_needs_a_preference_and_within_three_iterations(tmp_path):

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from bayespbrl import rollouts
+from bayespbrl import checks, rollouts
 from bayespbrl.envs import bicycle
 from bayespbrl.learner import Learner
 from bayespbrl.runs.directory import FIRST_POLICY_FILE, read_complete_summary
@@ -43,7 +43,9 @@ def collect(
         if name not in {"iteration", *nested} and (figures := _figures(values)) is not None:
             variables[name] = (("seed", "iteration", f"{name}_dimension")[: figures.ndim], figures)
     if all((Path(path) / BALANCING_FILE).exists() for path in directories):
-        lasted = [json.loads((Path(path) / BALANCING_FILE).read_text()) for path in directories]
+        lasted = [
+            _figures_in(Path(path) / BALANCING_FILE, "max_steps", "episodes", "mean_steps") for path in directories
+        ]
         limits = {name: lasted[0][name] for name in ("max_steps", "episodes")}
         variables["balancing_steps"] = ("seed", np.array([entry["mean_steps"] for entry in lasted]), limits)
     attributes = {"env": summaries[0]["env"], "utility": summaries[0]["utility"]}
@@ -119,9 +121,20 @@ def measure_first_policy(learner: Learner, directory: Path) -> None:
     write_file(directory / FIRST_POLICY_FILE, json.dumps(content, indent=1) + "\n")
 
 
+def _figures_in(file: Path, *names: str) -> dict[str, float]:
+    """The figures of these names in a file; `ValueError` where it has others, or cannot be read."""
+    try:
+        content = json.loads(file.read_text())
+        if not isinstance(content, dict) or not set(names) <= set(content):
+            raise ValueError(checks.shortened(content))
+        return {name: checks.number(name, content[name]) for name in names}
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{file}: expected {', '.join(names)}, got {checks.reason(error)}") from error
+
+
 def collect_first_policies(directories: Sequence[Path | str], env: str) -> xr.Dataset:
     """The values of first policies as one data set over (seed, iteration), the iteration being 0."""
-    values = [json.loads((Path(path) / FIRST_POLICY_FILE).read_text())["value"] for path in directories]
+    values = [_figures_in(Path(path) / FIRST_POLICY_FILE, "value")["value"] for path in directories]
     seeds = [int(Path(path).name.rpartition("-")[2]) for path in directories]
     column = np.array(values)[:, None]
     names = {"value": column, "value_newest": column, "answers": np.zeros_like(column, dtype=int)}
