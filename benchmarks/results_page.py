@@ -20,6 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import earlier_version
 import jinja2
 import numpy as np
 import pandas as pd
@@ -65,9 +66,19 @@ def page(studies: dict[str, StudyData]) -> str:
     def beside(name: str, task: str, file: str, unit: float) -> str:
         return published(studies[name], task, file, unit) if name in studies else ""
 
+    def beside_earlier_version() -> str:
+        name = "earlier-version"
+        return markdown(earlier_version.table(STUDIES / name, HERE / "results")) if name in studies else ""
+
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     template = environment.from_string((HERE / "RESULTS.md.jinja").read_text())
-    return template.render(tables=tables, figures=figures, beside=beside, columns=columns_of(NOTES))
+    functions = {
+        "tables": tables,
+        "figures": figures,
+        "beside": beside,
+        "beside_earlier_version": beside_earlier_version,
+    }
+    return template.render(**functions, columns=columns_of(NOTES))
 
 
 FIGURES = {"curves": curves_figure, "profiles": profiles_figure}
