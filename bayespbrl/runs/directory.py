@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from importlib.metadata import version
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -75,14 +74,15 @@ class RunDirectory:
     def create_fresh(cls, settings: Settings) -> "RunDirectory":
         """A new run directory under `runs/`, named after the environment and the time; errors as of `create`."""
         stem = f"{settings.env.replace('/', '-').lower()}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
-        for number in count(1):
-            path = Path("runs") / (stem if number == 1 else f"{stem}-{number}")
+        path, number = Path("runs") / stem, 1
+        while True:
             try:
                 return cls.create(path, settings)
             except ValueError:
                 if not path.exists():  # else another run has it, which may have begun in the same second
                     raise
-        raise AssertionError("unreachable")
+            number += 1
+            path = Path("runs") / f"{stem}-{number}"
 
     @classmethod
     def open(cls, path: Path | str) -> "RunDirectory":
