@@ -7,8 +7,8 @@
 
 On the paper's four tasks with 12 answers, twenty pairs of trials each: the value of what a version returns, a mean of
 100 episodes without the noise of the actions. The earlier version returns its newest policy, the default the one that
-it keeps. p is Wilcoxon's, adjusted by Holm's method for the tasks. A trial fails if it ends below -1300 (SwingUp),
--400 (Acrobot), -20 (Bicycle) or half of the optimum (Gridworld).
+it keeps. The study declares seeds, answers and the value below which a trial has failed. p is Wilcoxon's, adjusted by
+Holm's method for the tasks.
 
 Trials go on where they were stopped, one process each.
 """
@@ -27,13 +27,14 @@ from rows_by_seed import done, run
 
 from bayespbrl.results.intervals import holm, paired_difference
 from bayespbrl.results.study_data import read_study
-from bayespbrl.results.tables import markdown
+from bayespbrl.results.tables import markdown, median_and_quartile
+from bayespbrl.studies.declaration import declared
 from bayespbrl.studies.processes import ONE_THREAD
 
 HERE = Path(__file__).parent
-ANSWERS = 12
-SEEDS = range(3520, 3540)
-FAILED_BELOW = {"gridworld": 147.0, "swing-up": -1300.0, "bicycle": -20.0, "acrobot": -400.0}
+DECLARED = declared("earlier-version")
+ROWS = {row.levels[0]: row for row in DECLARED.rows}  # by task
+SEEDS = range(DECLARED.seed, DECLARED.seed + DECLARED.trials)
 COLUMNS = ("seed", "answers", "iterations", "value", "with_noise")
 
 
@@ -44,7 +45,8 @@ def rows_of(task: str, results: Path) -> Path:
 
 def trial(seed: int, *, task: str, checkout: Path) -> dict[str, float]:
     """The figures of one trial of the earlier version, in a process that imports that version."""
-    command = [sys.executable, str(HERE / "earlier_version_trial.py"), task, str(seed), str(ANSWERS)]
+    answers = ROWS[task].options["answers"]
+    command = [sys.executable, str(HERE / "earlier_version_trial.py"), task, str(seed), str(answers)]
     variables = os.environ | ONE_THREAD | {"PYTHONPATH": str(checkout)}
     printed = subprocess.run(command, env=variables, check=True, stdout=subprocess.PIPE, text=True).stdout
     return {name: float(value) for name, value in json.loads(printed.splitlines()[-1]).items()}
@@ -56,7 +58,7 @@ def table(study: Path, results: Path) -> pd.DataFrame:
     for row in read_study(study).rows:
         task = row.declared.levels[0]
         earlier = {int(line["seed"]): line for line in done(rows_of(task, results), COLUMNS)}
-        if row.declared.untrained or not earlier:
+        if not earlier:
             continue
         kept = dict(zip(row.seeds, row.final, strict=True))
         seeds = sorted(set(kept) & set(earlier))
@@ -69,7 +71,7 @@ def table(study: Path, results: Path) -> pd.DataFrame:
         p_values.append(p)
         line = {"task": task, "pairs": str(len(seeds))}
         for name, of in values.items():
-            line[name] = f"{np.median(of):.4g} [{np.quantile(of, 0.25):.4g}], {(of < FAILED_BELOW[task]).sum()} fail"
+            line[name] = f"{median_and_quartile(of)}, {(of < ROWS[task].failed_below).sum()} fail"
         lines.append(line | {"default − earlier": "{:.3g} [{:.3g}, {:.3g}]".format(*difference)})
     return pd.DataFrame(lines).assign(p=[f"{p:.2g}" for p in holm(p_values)])
 
@@ -78,7 +80,7 @@ def main() -> None:
     """Run the trials that are missing, if there is a checkout to run, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkout", type=Path, help="a working tree of commit 49879bc")
-    parser.add_argument("--tasks", nargs="+", choices=FAILED_BELOW, default=list(FAILED_BELOW))
+    parser.add_argument("--tasks", nargs="+", choices=ROWS, default=list(ROWS))
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--study", type=Path, default=HERE / "studies" / "earlier-version", help="of the default")
     parser.add_argument("--results", type=Path, default=HERE / "results", help="where the earlier version's rows are")

@@ -340,7 +340,7 @@ def test_wrong_options_of_the_neighbours_are_one_line(neighbours, tmp_path, monk
 
 
 def test_an_earlier_version_is_compared_pair_by_pair_with_the_policies_that_the_default_kept(tmp_path):
-    study = BENCHMARKS / "studies" / "paper-tasks"
+    study = BENCHMARKS / "studies" / "earlier-version"
     kept = pd.read_csv(study / "iterations.csv").query("tasks == 'gridworld' and methods == 'default'")
     kept = kept.drop_duplicates("seed", keep="last").set_index("seed")["value"].iloc[:6]
     earlier = pd.DataFrame({"seed": kept.index, "answers": 12, "iterations": 11, "value": kept.to_numpy() - 1.5})
@@ -352,7 +352,7 @@ def test_an_earlier_version_is_compared_pair_by_pair_with_the_policies_that_the_
     file = module.rows_of("gridworld", tmp_path)
     pd.concat([earlier, others]).assign(with_noise=lambda rows: rows["value"]).to_csv(file, index=False)
     table = module.table(study, tmp_path)
-    assert table["task"].tolist() == ["gridworld"]  # the SwingUp has no rows of the earlier version
+    assert table["task"].tolist() == ["gridworld"]  # the others have no rows of the earlier version
     assert table["pairs"].tolist() == ["6"]
     assert table["default − earlier"].str.startswith("1.5 [1.5, ").all()
     assert table["earlier"].str.endswith(", 1 fail").all()

@@ -71,7 +71,7 @@ def _of_trials(row: RowData, scale: tuple[float, float] | None, data: StudyData)
         "trials": f"{finished} of {wanted}" if isinstance(wanted, int) and finished < wanted else str(finished),
         "answers": f"{np.median(row.used):g}",
         **{
-            f"after {number}": MISSING if value is None else _median_and_quartile(value)
+            f"after {number}": MISSING if value is None else median_and_quartile(value)
             for number, value in zip(report_at, values, strict=True)
         },
         "median": f"{np.median(row.final):.4g}",
@@ -219,15 +219,16 @@ def kept_table(data: StudyData) -> pd.DataFrame:
         close = None if floor is None else best - kept <= CLOSE * np.maximum(best - floor, 0)
         lines.append(
             dict(zip(AXES, row.declared.levels, strict=True))
-            | {"trials": str(len(kept)), "kept": _median_and_quartile(kept), "worst": f"{kept.min():.4g}"}
-            | {"newest": _median_and_quartile(newest), "best of the run": _median_and_quartile(best)}
+            | {"trials": str(len(kept)), "kept": median_and_quartile(kept), "worst": f"{kept.min():.4g}"}
+            | {"newest": median_and_quartile(newest), "best of the run": median_and_quartile(best)}
             | {"within 3 % of the best": MISSING if close is None else f"{close.sum()} of {len(kept)}"}
         )
     table = pd.DataFrame(lines if others else [])
     return table.reindex(columns=_present(table)) if len(table) else table
 
 
-def _median_and_quartile(values: np.ndarray) -> str:
+def median_and_quartile(values: np.ndarray) -> str:
+    """Median [lower quartile], to four digits."""
     return f"{np.median(values):.4g} [{np.quantile(values, 0.25):.4g}]"
 
 
