@@ -90,6 +90,8 @@ FINITE = "environment Slope: expected finite observations and rewards, got NaN o
 FAULTS = {
     "observation": FINITE,
     "reward": FINITE,
+    "no reward": "environment Slope failed at step 3: ValueError: expected a number as the reward, got None",
+    "rewards": r"environment Slope failed at step 3: ValueError: expected a number as the reward, got array\(\[1",
     "raises": "environment Slope failed at step 3: RuntimeError: the motor is on fire",
 }
 

@@ -163,6 +163,16 @@ def test_the_policy_is_the_full_process_about_the_centre_of_the_action_range():
     np.testing.assert_allclose(variance[:, 0], full_variance, rtol=1e-5)
 
 
+@pytest.mark.parametrize("number", [5, 12])
+def test_the_layout_of_the_arrays_in_memory_does_not_matter(number):
+    rng = np.random.default_rng(7)
+    points, targets, weights = some_samples(100, rng)
+    policy = policy_with_hyperparameters().fit(points, targets[:, None], weights, rng=rng, evaluations=0)
+    read = replace(policy, reduction=np.ascontiguousarray(policy.reduction))
+    assert read.reduction.strides != policy.reduction.strides
+    np.testing.assert_array_equal(read.mean_and_variance(points[:number]), policy.mean_and_variance(points[:number]))
+
+
 @pytest.mark.slow
 def test_traceable_moments_equal_the_matrix_products():
     rng = np.random.default_rng(8)

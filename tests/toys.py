@@ -40,7 +40,8 @@ class Slope(gymnasium.Env):
             raise RuntimeError("the motor is on fire")
         self.position = self.position + 0.3 * float(action[0]) + self.np_random.normal(0, 0.02, 2)
         seen = np.full(2, np.nan) if fault == "observation" else self.position.copy()
-        return seen, np.nan if fault == "reward" else float(self.position.sum()), False, False, {}
+        faulty = {"reward": np.nan, "no reward": None, "rewards": np.ones(1, np.float32)}
+        return seen, faulty[fault] if fault in faulty else float(self.position.sum()), False, False, {}
 
 
 class Odd(gymnasium.Env):

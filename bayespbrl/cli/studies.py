@@ -1,5 +1,6 @@
 """What the command line shows of a declared study: its plan, its progress, its failures."""
 
+import shlex
 from concurrent.futures import Executor
 
 from bayespbrl.cli.display import console, progress_bar
@@ -41,7 +42,9 @@ def run_study(study: Study, where: int | Executor, command: str) -> list[Failure
             raise
     for failure in failures[:MOST_FAILURES]:
         console.print(f"Failed: {failure}")
-    console.print(f"Table: {study.directory / 'iterations.csv'}; bayespbrl results {study.directory}")
+    permission = ["--import-package"] * any(":" in row.env for row in study.declaration.rows)
+    results = shlex.join(["bayespbrl", "results", str(study.directory), *permission])
+    console.print(f"Table: {study.directory / 'iterations.csv'}; {results}")
     return failures
 
 

@@ -136,8 +136,10 @@ class _Silent(gymnasium.Wrapper):
         return self.env.reset(**arguments)[0], {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """A step without its info."""
+        """A step without its info; NumPy would make NaN of a reward that is None."""
         observation, reward, terminated, truncated, _ = self.env.step(action)
+        if reward is None or np.asarray(reward).ndim:
+            raise ValueError(f"expected a number as the reward, got {reward!r}")
         return observation, reward, terminated, truncated, {}
 
 

@@ -155,7 +155,8 @@ class GaussianProcessPolicy:
         ):
             correlations = kernels.radial_basis(observations, points, bandwidths, np.asarray(self.period))
             means.append(correlations @ mean_weights)
-            explained.append(np.square(correlations @ reduction.T).sum(axis=1))
+            # the layout in memory decides on the last digit, and that of a policy read from disk is another
+            explained.append(np.square(correlations @ np.ascontiguousarray(reduction.T)).sum(axis=1))
         left = np.maximum(1.0 - np.stack(explained, axis=1), 0.0)
         # Snelson & Ghahramani (2006), predictive mean and variance
         variance = np.asarray(self.signal_variance) * left + np.asarray(self.noise_variance)
