@@ -295,6 +295,13 @@ def test_of_several_people_nobody_is_asked_again_what_they_were_asked_just_now()
     assert {one.number for one in of("Ben")} == {3, 4, 5}
 
 
+def test_where_repeats_are_shared_nobody_is_asked_what_others_were_asked_just_now():
+    past = [PastQuestion(n, 0, n, n, None, Answer.FIRST, "Ada", None) for n in range(1, 9)]
+    options, rng = Questions(repeats=0.5, shared_repeats=True), np.random.default_rng(0)
+    again = {repeated(past, 9, options, left=9, rng=rng, answerer="Ben").number for _ in range(100)}
+    assert again == {1, 2, 3, 4, 5}  # the last three are too fresh, though Ben has answered none
+
+
 def test_a_question_that_is_being_repeated_to_somebody_is_not_repeated_to_another():
     past = [PastQuestion(n, 0, n, n, None, Answer.FIRST, "Ada", None) for n in range(1, 9)]
     options, rng = Questions(repeats=0.2, shared_repeats=True), np.random.default_rng(0)

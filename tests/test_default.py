@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 
@@ -17,6 +18,7 @@ from bayespbrl import Learner, ReturnExpert, cycle, rollouts
 from bayespbrl.envs import opening
 from bayespbrl.events import answered
 from bayespbrl.improvement.check import Check
+from bayespbrl.policies import greedy
 from bayespbrl.rollouts import rollout
 from bayespbrl.runs.actor import Actor
 from bayespbrl.runs.files import write_netcdf
@@ -169,6 +171,19 @@ def test_after_a_restart_the_kept_policy_gives_way_only_to_a_clearly_better_one(
         assert restarted.learner.policy.policy is state.restart.policy
 
 
+@pytest.mark.parametrize("newest", [True, False])
+def test_after_a_restart_the_best_policy_is_judged_by_its_own_trajectories(restarted, newest):
+    state, cycle_ = restarted.learner.state, restarted.learner.cycle
+    bad = worst_first(state, state.tried)
+    good = tuple(max(state.trajectories, key=lambda each: state.estimate.trajectory_utilities([each])[0]) for _ in bad)
+    restart = replace(state.restart, tried=tuple(state.trajectories[: len(bad)]))
+    of_the_two = {"tried": good, "best_tried": bad} if newest else {"tried": bad, "best_tried": good}
+    check = Check(state.iteration if newest else state.best, 1.0)
+    of_best = state.estimate.trajectory_utilities(good)
+    kept = cycle_._kept(replace(state, restart=restart, **of_the_two), state.estimate, check, of_best, bad)
+    assert kept == check.best
+
+
 def worst_first(state, tried):
     """As many trajectories as `tried`, each the one that the posterior thinks least of."""
     everything = state.trajectories
@@ -274,6 +289,43 @@ def test_a_step_back_goes_on_from_the_kept_policy_with_less_trust():
         assert check["stepped_back"] == (check["gain"] < -check["standard_error"])
         assert summary["kl_bound"] <= check["trust"] * 1.0 + 1e-12
     assert all(summary["check"]["trust"] < 1 for summary in backwards)
+
+
+def test_after_a_step_back_the_update_begins_with_the_best_policy(run):
+    state, cycle_ = run.learner.state, run.learner.cycle
+    before = replace(state, trajectories=state.trajectories[-20:])
+
+    def updated(state, stepped_back):
+        improved, _ = cycle_.update(state, state.estimate, Check(state.best, 0.5, stepped_back))
+        return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(improved.policy)]
+
+    back = updated(before, True)
+    assert back == updated(replace(before, policy=state.best_policy), False)
+    assert back != updated(before, False)
+
+
+@pytest.mark.slow
+def test_each_random_choice_has_a_stream_of_its_own(monkeypatch):
+    drawn, real = Counter(), cycle.Cycle._rng
+
+    def counted(self, purpose, count):
+        drawn[purpose, count] += 1
+        return real(self, purpose, count)
+
+    monkeypatch.setattr(cycle.Cycle, "_rng", counted)
+    learner = Learner(Slope(), answers=4, same_start=True, iterations=4, repeats=0.2, **FAST).run(ReturnExpert())
+    of_all_policies = {(cycle.EVALUATE, 0), (cycle.CHECK, 0), (cycle.STARTS, 0)}
+    of_an_update = {(cycle.IMPROVE, n) for n in range(4)}  # fresh actions by a key, the fit by a generator
+    assert {stream for stream, times in drawn.items() if times > 1} == of_all_policies | of_an_update
+    assert len(learner.iterations) == 4
+    each = {(purpose, n) for purpose in (cycle.COLLECT, cycle.FIT, cycle.VISITED) for n in range(4)}
+    assert each | {(cycle.FEATURES, n) for n in range(8)} <= set(drawn)
+
+
+def test_the_value_is_that_of_the_policy_without_its_noise(run):
+    newest = run.learner.last_policy
+    assert run.iterations[-1]["value_newest"] == run.learner.cycle.evaluated(greedy(newest)).total.mean()
+    assert run.iterations[-1]["value_newest"] != run.learner.cycle.evaluated(newest).total.mean()
 
 
 class Unseeded(Slope):

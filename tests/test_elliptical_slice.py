@@ -372,6 +372,23 @@ def test_a_move_without_an_acceptable_candidate_stays_and_says_so():
     np.testing.assert_array_equal(mcmc.get_samples()["x"], np.full((3, 2), 0.25))
 
 
+@pytest.mark.parametrize("nowhere", [(True, False), (False, True), (False, False)])
+def test_a_draw_is_stuck_where_the_moves_round_any_of_its_ellipses_were(nowhere):
+    def model():
+        numpyro.sample("x", dist.Normal(0, 1).expand([2]).to_event(1))
+
+    def ellipse(height):
+        def noise(key, moves):
+            return jax.random.normal(key, (moves, 2))
+
+        return Ellipse(lambda x: x, noise, lambda v: jnp.full(len(v), height), lambda v: v)
+
+    ellipses = [(ellipse(-jnp.inf if impossible else 0.0), 1) for impossible in nowhere]
+    kernel = EllipticalSlice(model, max_candidates=16, ellipses=lambda *_: ellipses)
+    state = kernel.init(jax.random.key(0), 0, None)
+    assert kernel.sample(state).stuck == any(nowhere)
+
+
 @pytest.mark.parametrize(
     ("prior", "message"),
     [

@@ -23,7 +23,7 @@ from bayespbrl.models import (
 )
 from bayespbrl.models.chains import Chains
 from bayespbrl.models.convergence import Convergence, chain_convergence
-from bayespbrl.models.gibbs import conditional
+from bayespbrl.models.gibbs import OTHER_THRESHOLDS, _some_thresholds, conditional
 from bayespbrl.models.posterior import SamplerOptions
 from bayespbrl.models.posterior_tree import answers_of, bases_of
 
@@ -194,6 +194,23 @@ def test_settings_that_need_different_thresholds_both_keep_their_probability(peo
     assert share == pytest.approx(1 - expected["setting"], abs=0.1)
 
 
+def test_a_threshold_is_drawn_among_the_present_one_and_a_few_others_each_once():
+    """Were the present one among them twice, it would be drawn too often."""
+    tied = np.array([False, True, False, False])
+    fit = fit_gaussian(SETTINGS[0], PreferenceModel(), indifferent=tied)
+    with jax.enable_x64(True):
+        chains = Chains.start([fit], num_chains=400, chunk=25, seed=0)
+        keys = jax.random.split(jax.random.key(1), 400)
+        some = jax.vmap(lambda key, unknowns: _some_thresholds(key, unknowns, chains.problem)[0])
+        numbers, present = np.asarray(some(keys, chains.unknowns)), np.asarray(chains.unknowns.tie_threshold)
+    assert all(len(set(each)) == OTHER_THRESHOLDS + 1 for each in numbers.tolist())
+    assert np.all(np.any(numbers == present[:, None], axis=1))
+    steps = (numbers - present[:, None]) % len(priors.TIE_THRESHOLD.values)
+    counts = np.bincount(steps[steps > 0])[1:]  # of each of the eleven others
+    assert len(counts) == len(priors.TIE_THRESHOLD.values) - 1
+    assert stats.chisquare(counts).pvalue > 1e-3
+
+
 def test_ties_that_contradict_each_other_are_lapses_and_the_chains_converge():
     """Of a Pendulum run where every third answer was a tie, whatever was shown: 4 settings, 16 ordered answers, 4 ties.
 
@@ -271,6 +288,21 @@ def test_the_side_bias_has_its_whole_prior_where_the_features_explain_the_answer
     bias, margins = drawn["side_bias"].values, drawn["utility_weights"].values @ np.array([1.0, 0.0, 2.0])
     np.testing.assert_allclose(margins + bias, drawn["margins"].values[:, :, 0], atol=1e-9)
     assert bias.std() == pytest.approx(priors.SIDE_BIAS_SCALE, rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prior_scale", [0.5, 3.0])
+def test_the_side_bias_is_in_units_of_the_margin_whatever_the_scale_of_the_weights(prior_scale):
+    sides, who = np.array([1, -1, 1, 0]), np.array([0, 1, 1, 0])
+    model, answers = PreferenceModel(prior_scale), Answers(shown_first=sides, answerers=who)
+    tree = posterior_draws(SETTINGS[0], model, seed=1, answers=answers, sampler=SamplerOptions(25, 25, 25))
+    drawn = tree["posterior"].dataset
+    without = drawn["utility_weights"].values @ SETTINGS[0].T
+    biases = drawn["side_bias"].values[:, :, who] * sides
+    np.testing.assert_allclose(without + biases, drawn["margins"].values, atol=1e-9)
+    prior = PreferenceModel(prior_scale, lapse_rate=0.999)  # answers that tell nothing
+    tree = posterior_draws(SETTINGS[0], prior, seed=1, answers=answers, sampler=SamplerOptions(100, 1000, 1000))
+    assert tree["posterior/side_bias"].values.std() == pytest.approx(priors.SIDE_BIAS_SCALE, rel=0.1)
 
 
 @pytest.mark.slow

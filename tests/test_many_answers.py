@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayespbrl.models import PreferenceModel, fit_gaussian, priors, sample_posterior, step_moves
+from bayespbrl.models import PreferenceModel, fit_gaussian, priors, refraction, sample_posterior, step_moves
 from bayespbrl.models.chains import FEW, Chains, flight_draw
 from bayespbrl.models.convergence import chain_convergence
 from bayespbrl.models.elliptical_slice import elliptical_moves, independent_move
@@ -107,9 +107,75 @@ def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterio
     assert np.all(error < 0.035 * draws.std(axis=(0, 1)))
 
 
-@pytest.mark.parametrize("move", [pytest.param("axis", marks=pytest.mark.slow), "independent", "split"])
-def test_a_move_of_its_own_kind_leaves_the_posterior_as_it_is(move):
-    rows, steepness, lapse_rate = answers(70, seed=5), 5.0, 0.2
+@pytest.mark.slow
+@pytest.mark.parametrize("transport", [False, True])
+def test_moves_among_steps_sample_the_lapse_rate_of_each_of_two_people_as_by_quadrature(transport, monkeypatch):
+    monkeypatch.setattr(step_moves, "MANY_DIMENSIONS", 0 if transport else 2**20)
+    rows = answers(16, seed=7, wrong=0.0)
+    rows[12:] *= -1  # the second person errs in four of six answers
+    who = np.arange(16) >= 10
+    fit = fit_gaussian(rows, PreferenceModel(lapse_rate=None))
+    with jax.enable_x64(True):
+        by_answerer = np.stack([~who, who]).astype(float)
+        chains = Chains.start([fit], num_chains=8, chunk=25, seed=0, by_answerer=by_answerer)
+        problem, steps = chains.problem, step_moves.steps_of([fit], chains.problem)
+
+        def step(last, key):
+            z, unknowns, _ = step_moves.step_moves(key, *last, problem, steps)
+            return (z, unknowns), (z[:2], unknowns.lapse_rate)
+
+        start, keys = chains.state.z["utility_weights"], jax.random.split(jax.random.key(1), (8, 1500))
+        moves = jax.jit(jax.vmap(lambda z, unknowns, keys: jax.lax.scan(step, (z, unknowns), keys)[1]))
+        z, numbers = moves(start, chains.unknowns, keys)
+    rates, shares = priors.LAPSE_RATE
+    draws = np.concatenate([np.asarray(z) @ fit.factors.basis.T, rates[np.asarray(numbers)]], axis=2)[:, 50:]
+    p = prob(likelihood_of("mixed", 16.0, steepness=5.0), POINTS @ rows.T)
+    each = [rate / 2 + (1 - rate) * p for rate in rates]
+    first, second = (np.array([q[:, chosen].prod(axis=1) for q in each]) * shares[:, None] for chosen in (~who, who))
+    together = np.einsum("in,jn,n->ijn", first, second, np.exp(-0.5 * np.sum(POINTS**2, axis=1)))
+    together /= together.sum()
+    expected = [*(together.sum((0, 1)) @ POINTS), rates @ together.sum((1, 2)), rates @ together.sum((0, 2))]
+    error = chain_convergence(draws).monte_carlo_error
+    assert np.all(np.abs(draws.mean(axis=(0, 1)) - expected) < 4 * error)
+    assert np.all(error < 0.05 * draws.std(axis=(0, 1)))
+
+
+def flown_from_one_point(monkeypatch, *, model, walls):
+    """That point, where 64 calls of the moves lead from it, and whether a flight met more walls than so many."""
+    monkeypatch.setattr(step_moves, "MANY_DIMENSIONS", 0)
+    fit = fit_gaussian(answers(12, seed=7), model)
+    with jax.enable_x64(True):
+        chains = Chains.start([fit], num_chains=1, chunk=25, seed=0)
+        problem, steps = chains.problem, step_moves.steps_of([fit], chains.problem)
+        monkeypatch.setattr(refraction, "MOST_EVENTS", walls / problem.settings.loadings.shape[1])
+        start, unknowns = chains.state.z["utility_weights"][0], jax.tree.map(lambda part: part[0], chains.unknowns)
+        keys = jax.random.split(jax.random.key(2), 64)
+        moves = jax.jit(jax.vmap(lambda key: step_moves.step_moves(key, start, unknowns, problem, steps)))
+        z, _, given_up = moves(keys)
+    return np.asarray(start), np.asarray(z), np.asarray(given_up)
+
+
+@pytest.mark.slow
+def test_a_flight_that_is_given_up_leaves_the_weights_where_they_are(monkeypatch):
+    start, z, given_up = flown_from_one_point(monkeypatch, model=PreferenceModel(), walls=2)
+    assert 0.2 < given_up.mean() < 0.8
+    np.testing.assert_allclose(z[given_up], np.broadcast_to(start, z[given_up].shape), rtol=1e-12)
+    assert np.mean(np.any(z[~given_up] != start, axis=1)) > 0.1
+
+
+@pytest.mark.slow
+def test_a_draw_says_so_where_any_of_its_flights_was_given_up(monkeypatch):
+    _, _, given_up = flown_from_one_point(monkeypatch, model=PreferenceModel(lapse_rate=None), walls=4)
+    assert given_up.mean() > 0.4  # of single flights one in twenty is
+
+
+@pytest.mark.parametrize(
+    ("move", "width"),
+    [pytest.param("axis", 1.0, marks=pytest.mark.slow), ("independent", 1.0), ("split", 1.0), ("split", 0.6)],
+)
+def test_a_move_of_its_own_kind_leaves_the_posterior_as_it_is(move, width):
+    # of few answers the prior has its share, and so what the reference is narrower than the prior
+    rows, steepness, lapse_rate = answers(70 if width == 1 else 8, seed=5), 5.0 if width == 1 else 1.0, 0.2
     name = "logistic" if move == "split" else "mixed"
     model = PreferenceModel(1.0, steepness, lapse_rate, name)
     fit = fit_gaussian(rows, model)
@@ -132,7 +198,8 @@ def test_a_move_of_its_own_kind_leaves_the_posterior_as_it_is(move):
             if move == "axis":
                 z, _, _ = elliptical_moves(key, z, axis_ellipse(problem), moves=2, batch=4, max_candidates=200)
             elif move == "split":
-                z = split_move(key, z, problem._replace(excess=0.0, width=1.0))
+                scaled = problem.site_precisions / width**2
+                z = split_move(key, z, problem._replace(site_precisions=scaled, excess=1 / width**2 - 1, width=width))
             else:
                 z = independent_move(key, z, reference_ellipse(problem), candidates=64)
             return z, z

@@ -94,6 +94,14 @@ def test_the_error_of_an_evidence_without_overlap_is_infinite():
     assert _bridged(rng.normal(40, 9, 1000), far, 1.0)[1] == np.inf
 
 
+def test_the_evidence_counts_draws_that_repeat_each_other_once():
+    rng = np.random.default_rng(0)
+    posterior, proposal = rng.normal(0.5, 1, 500), rng.normal(-0.5, 1, 1000)
+    once, four_times = _bridged(posterior, proposal, 1.0), _bridged(np.repeat(posterior, 4), proposal, 0.25)
+    assert four_times == pytest.approx(once, rel=1e-6)
+    assert four_times[1] > 1.2 * _bridged(np.repeat(posterior, 4), proposal, 1.0)[1]
+
+
 def test_no_preferences_give_the_prior():
     tree = sample_posterior(np.zeros((0, 3)), prior_scale=2.0, num_samples=500)
     w = tree["posterior/utility_weights"].values

@@ -72,6 +72,10 @@ def test_gains_are_counted_by_what_the_schedule_said():
     back = run((3, 0.3), (-1, 0.3), (2, 0.3))
     back[2]["check"] = {"stepped_back": True, "best": 1}  # from 3 to 2
     np.testing.assert_allclose(gain_calibration([back], edges=(0, 0.5, 1))["gained"][0], 0.0)
+    at_edges = gain_calibration([run((0, None), (1, 0.25), (2, 0.5), (1, 1.0))], edges=(0.25, 0.5, 1))
+    np.testing.assert_allclose(
+        [at_edges["updates"], at_edges["stated"], at_edges["gained"]], [[1, 2], [0.25, 0.75], [1, 0.5]]
+    )
     assert np.all(gain_calibration([], "signal")["updates"] == 0)
     with pytest.raises(ValueError, match="edges: expected"):
         gain_calibration(runs, edges=(1, 0))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -95,6 +97,12 @@ def test_an_unreachable_bound_is_reported_as_inactive_and_the_policy_turns_greed
     greedy = q_values.reshape(2, 2).argmax(axis=1)
     conditional = solution.probabilities.reshape(2, 2) / solution.probabilities.reshape(2, 2).sum(axis=1, keepdims=True)
     assert np.all(conditional[[0, 1], greedy] > 0.99)
+
+
+def test_a_bound_is_active_where_kl_is_within_a_hundredth_of_it():
+    solution = reps_weights(*random_problem(), kl_bound=0.5)
+    active = [replace(solution, kl=share * 0.5).bound_active for share in (0.98, 0.992, 1.0, 1.008, 1.02)]
+    assert active == [False, True, True, True, False]
 
 
 @pytest.mark.parametrize("kl_bound", [50.0, 1e6])

@@ -203,6 +203,17 @@ def test_the_mean_is_the_mean_of_the_draws_over_all_settings(walked):
     )
 
 
+def test_the_prior_deviation_of_a_state_is_that_of_all_settings_together(walked):
+    estimate, walks = walked
+    states = walks[1].states
+    settings = zip(estimate.multiples, estimate.scales, strict=True)
+    each = np.array([estimate.features.rescaled(multiples)(states) / scale for multiples, scale in settings])
+    variances = np.sum(each**2, axis=2).mean(axis=0)  # means of zero: the variance of the mixture is the mean
+    np.testing.assert_allclose(estimate.prior_deviations(states), np.sqrt(variances))
+    wide = infer_utility(np.eye(2), [(0, 1)], prior_scale=3.0, features=OneHot(2))
+    np.testing.assert_allclose(wide.prior_deviations(np.arange(2)), 3 / np.sqrt(2))  # of differences of length √2
+
+
 def test_each_draw_is_of_the_features_of_its_own_setting(walked):
     estimate, walks = walked
     states = walks[1].states
