@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.special import entr
 
 from bayespbrl import checks
-from bayespbrl.models.likelihoods import Likelihood, prob
+from bayespbrl.models.likelihoods import Likelihood, prob, with_threshold
 from bayespbrl.preferences import Query
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
@@ -25,6 +25,8 @@ from bayespbrl.utility.estimate import UtilityEstimate
 # Posterior draws that a rule looks at: enough to order ten candidates, in hundredths of a second.
 QUERY_DRAWS = 500
 MOST_OLDER = 20  # their draws would soon cost more than all else
+# Answers of which all are ties: from so many on it counts as information whether the next is one too.
+ONLY_TIES = 4
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class QuerySituation:
       incumbent: number of the newest undominated one.
       opponents: whom a trajectory would be compared with, by number; the incumbent where it names none.
       undominated: numbers of all that no answer puts below another, about which no question is asked.
+      only_ties: number of answers so far where all are ties; 0 where one is not.
       estimate: the utility estimate of the last iteration.
       signal: of the last iteration's bound; None where the schedule has none.
       rng: of everything random.
@@ -52,6 +55,7 @@ class QuerySituation:
     rng: np.random.Generator
     opponents: Mapping[int, int] = field(default_factory=dict)
     undominated: Sequence[int] = ()
+    only_ties: int = 0
 
     def draws(self) -> tuple[Float[np.ndarray, "s n"], Float[np.ndarray, "s n"]]:
         """Posterior draws of the utility of each new trajectory and of its opponent."""
@@ -63,8 +67,19 @@ class QuerySituation:
 
     def information(self) -> Float[np.ndarray, " n"]:
         """The `expected_information` of a question about each new trajectory."""
+        return self.informed()[1]
+
+    def informed(self) -> tuple[Float[np.ndarray, "s n"], Float[np.ndarray, " n"]]:
+        """`draws` of the new trajectories, and `information`.
+
+        Decision: a tie counts as an answer only from `ONLY_TIES` on. Where goals are seldom reached, as on
+        FrozenLake-v1, it is what tells a trajectory that reached one from all others; where some answers order
+        trajectories, which of two is better tells more.
+        """
         utilities, opponents = self.draws()
-        return expected_information(utilities, opponents, likelihood=self.estimate.likelihood(QUERY_DRAWS))
+        thresholds = self.estimate.tie_thresholds(QUERY_DRAWS) if self.only_ties >= ONLY_TIES else None
+        likelihood = self.estimate.likelihood(QUERY_DRAWS)
+        return utilities, expected_information(utilities, opponents, likelihood=likelihood, tie_thresholds=thresholds)
 
 
 QueryRule = Callable[[QuerySituation], Sequence[int]]
@@ -92,9 +107,7 @@ def thompson(situation: QuerySituation) -> list[int]:
 
 def information(situation: QuerySituation) -> list[int]:
     """The comparison whose answer has the highest `expected_information` first."""
-    utilities, opponents = situation.draws()
-    scores = expected_information(utilities, opponents, likelihood=situation.estimate.likelihood(QUERY_DRAWS))
-    return _ordered(situation, utilities, scores)
+    return _ordered(situation, *situation.informed())
 
 
 def disagreement(situation: QuerySituation) -> list[int]:
@@ -202,35 +215,40 @@ def expected_information(
     opponents: Float[np.ndarray, "s n"] | Float[np.ndarray, " s"],
     *,
     likelihood: Likelihood,
+    tie_thresholds: Float[np.ndarray, "s 1"] | None = None,
 ) -> Float[np.ndarray, " n"]:
-    """Expected information gain of each comparison, in nats, at most log 2.
+    """Expected information gain of each comparison, in nats, at most log 2, or log 3 with ties.
 
     The mutual information of answer and weights, H(E p) − E H(p), with p the likelihood of the one answer at each draw
-    and H the entropy of a coin: it is large where the draws are each sure and do not agree. What no weights could
+    and H the entropy of the answer: it is large where the draws are each sure and do not agree. What no weights could
     predict, as the coin tosses of a lapse rate, does not count.
 
     Args:
       utilities, opponents: posterior draws, shapes (S, n), and (S, n) or (S,) for one opponent of all.
       likelihood: of an answer given its margin, the difference of the two utilities; its parameters are numbers, or
         have shape (S, 1), one for each draw.
+      tie_thresholds: of each draw, where "no difference" counts as an answer; None: it is left out of account.
 
     Returns:
       shape (n,).
-
-    Decision: an answer of "no difference" is left out of account, even where its threshold is inferred.
 
     Source: Houlsby, Huszár, Ghahramani and Lengyel (2011), "Bayesian active learning for classification and preference
     learning", eq. 2.
     """
     utilities, opponents = _fitting_draws(utilities, opponents)
-    p = prob(likelihood, utilities - opponents)
+    margins = utilities - opponents
+    if tie_thresholds is None:
+        answers = [prob(likelihood, margins)]
+    else:
+        ordered = with_threshold(likelihood, tie_thresholds, np.zeros(margins.shape[1], bool))
+        answers = [prob(ordered, margins), prob(ordered, -margins)]
     # Houlsby et al. (2011), eq. 2; the estimate from the same draws is never negative but for rounding
-    return np.maximum(_entropy(p.mean(axis=0)) - _entropy(p).mean(axis=0), 0.0)
+    return np.maximum(_entropy([p.mean(axis=0) for p in answers]) - _entropy(answers).mean(axis=0), 0.0)
 
 
-def _entropy(p: np.ndarray) -> np.ndarray:
-    """Entropy of a Bernoulli variable with probability p, in nats."""
-    return entr(p) + entr(np.maximum(1 - p, 0.0))
+def _entropy(probabilities: Sequence[np.ndarray]) -> np.ndarray:
+    """Entropy of an answer with these probabilities, and one more answer with what they leave, in nats."""
+    return np.asarray(sum(entr(p) for p in probabilities) + entr(np.maximum(1 - sum(probabilities), 0.0)))
 
 
 def _fitting_draws(utilities: np.ndarray, opponents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -40,6 +40,19 @@ def test_one_hot_marks_the_state():
     np.testing.assert_array_equal(OneHot(3)(np.array([2, 0])), [[0, 0, 1], [1, 0, 0]])
 
 
+def test_standardised_features_vary_alike_between_trajectories():
+    rng = np.random.default_rng(0)
+    paths = [np.array([0, *rng.integers(3, size=rng.integers(1, 9)), *[3] * (n == 5)]) for n in range(20)]
+    walks = [Trajectory(path, path[1:], np.zeros(len(path) - 1), terminated=True) for path in paths]
+    options = RadialBasisOptions(10, standardised=True)
+    features = FeatureSource(Discrete(5), Discrete(3)).of_states(walks, options, rng=rng)
+    sums = trajectory_features(walks, features, discount=1.0)
+    np.testing.assert_allclose(sums[:, :3].std(axis=0), 1.0)
+    # the goal, which one of twenty reaches; another state, which none has reached, as if one had
+    np.testing.assert_allclose(features(np.array([3, 4])).sum(axis=1), np.sqrt(20))
+    assert sums[5, 3] == pytest.approx(np.sqrt(20))
+
+
 def walk(*states, number=4):
     """The diffusion basis of one trajectory through these of so many states."""
     steps = len(states) - 1

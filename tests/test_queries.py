@@ -9,6 +9,7 @@ import pytest
 from bayespbrl.models.likelihoods import Logistic, Mixed, Probit, WithLapses
 from bayespbrl.preferences import Preferences, opponents_from_the_same_start, rivals, same_starts
 from bayespbrl.queries import (
+    ONLY_TIES,
     QUERY_RULES,
     InformationWhenUnsure,
     QuerySituation,
@@ -160,6 +161,31 @@ def test_expected_information_matches_the_mutual_information_of_the_joint_table(
         expected.append(np.sum(joint * np.log(joint / independent)))
     information = expected_information(utilities, incumbent, likelihood=Logistic(steepness))
     np.testing.assert_allclose(information, expected, rtol=1e-10)
+
+
+def test_expected_information_counts_a_tie_as_an_answer_where_it_is_told_of_thresholds():
+    rng = np.random.default_rng(4)
+    margins, thresholds, lapse_rate = rng.normal(size=(50, 3)), rng.gamma(2.0, 0.3, size=(50, 1)), 0.2
+
+    def sigmoid(t):
+        return 1 / (1 + np.exp(-1.4 * t))
+
+    attentive = np.array([sigmoid(margins - thresholds), sigmoid(-margins - thresholds)])
+    p = lapse_rate / 3 + (1 - lapse_rate) * np.concatenate([attentive, 1 - attentive.sum(axis=0, keepdims=True)])
+    joint = p / 50  # (answer, draw, comparison)
+    independent = joint.sum(axis=0, keepdims=True) * joint.sum(axis=1, keepdims=True)
+    likelihood = WithLapses(Logistic(1.4), lapse_rate)
+    information = expected_information(margins, np.zeros(50), likelihood=likelihood, tie_thresholds=thresholds)
+    np.testing.assert_allclose(information, np.sum(joint * np.log(joint / independent), axis=(0, 1)), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("ties", "first"), [(0, 1), (ONLY_TIES - 1, 1), (ONLY_TIES, 0)])
+def test_after_nothing_but_ties_information_is_asked_about_what_may_be_none(ties, first):
+    # The first newcomer is much better or no worse; the second is a little better or worse: a tie for certain.
+    utilities = np.column_stack([np.repeat([0.01, 9.0], 50), np.tile([-0.1, 0.1], 50)])
+    given = replace(situation(utilities, np.zeros(100), likelihood=Logistic(90.0)), only_ties=ties)
+    given.estimate.tie_thresholds = lambda number=None: np.full((100, 1), 1.0)
+    assert candidates(QUERY_RULES["information"], given)[0] == first
 
 
 def test_answers_that_are_coin_tosses_tell_nothing_and_draws_that_agree_tell_nothing():

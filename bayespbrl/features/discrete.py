@@ -17,15 +17,22 @@ MOST_CONNECTED = 1000  # discrete states of a diffusion basis; the eigenvectors 
 
 @dataclass(frozen=True, eq=False)
 class OneHot:
-    """φ(s) = e_s for discrete states: the paper's tabular model, in which linear functions are exact (step 1)."""
+    """φ(s) = e_s for discrete states: the paper's tabular model, in which linear functions are exact (step 1).
+
+    Attributes:
+      number_of_states: S.
+      scales: c of φ(s) = c_s e_s, or one number for all.
+    """
 
     number_of_states: int
+    scales: Float[np.ndarray, " s"] | float = 1.0
 
     def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n {self.number_of_states}"]:
         """Features of N integer observations."""
         observations = indices("observations", observations, self.number_of_states)
         features = np.zeros((len(observations), self.number_of_states))
-        features[np.arange(len(observations)), observations] = 1.0
+        scales = np.broadcast_to(self.scales, self.number_of_states)
+        features[np.arange(len(observations)), observations] = scales[observations]
         return features
 
 
@@ -58,6 +65,20 @@ class DiffusionBasis:
     def rescaled(self, multiples: ArrayLike) -> Self:
         """The same graph with a length scale `multiples` times as long."""
         return replace(self, bandwidths=self.bandwidths * np.asarray(multiples))
+
+
+def standardised(trajectories: Sequence[Trajectory], number_of_states: int) -> OneHot:
+    """One-hot features that vary alike between trajectories: divided by the standard deviation of a state's visits.
+
+    Where weights are alike a priori, a goal that few trajectories reach, once each, would hardly count beside states in
+    which they stay. What all visit equally often, or none, is divided by what one visit in all would give.
+    """
+    visits = np.zeros((len(trajectories), number_of_states))
+    for row, trajectory in zip(visits, trajectories, strict=True):
+        states = indices("states", trajectory.states, number_of_states)
+        np.add.at(row, states[1:], 1.0)  # utilities are of the states that steps lead to
+    deviations = np.sqrt(np.maximum(visits.var(axis=0), 1 / len(trajectories)))
+    return OneHot(number_of_states, 1 / deviations)
 
 
 def diffusion_basis(trajectories: Sequence[Trajectory], number_of_states: int) -> DiffusionBasis:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Shaped
 from numpy.typing import ArrayLike
 
 from bayespbrl.checks import indices, matrix
-from bayespbrl.features.discrete import MOST_CONNECTED, OneHot, diffusion_basis
+from bayespbrl.features.discrete import MOST_CONNECTED, OneHot, diffusion_basis, standardised
 from bayespbrl.features.functions import StateFeatures, checked_features
 from bayespbrl.features.radial import JointRadialBasis, RadialBasis, RadialBasisOptions
 from bayespbrl.trajectories import Trajectory, Transitions
@@ -121,6 +121,8 @@ class FeatureSource:
         space = self.observation_space
         if options.diffusion and isinstance(space, Discrete) and space.n <= MOST_CONNECTED:
             return diffusion_basis(trajectories, int(space.n))
+        if options.standardised and isinstance(space, Discrete):
+            return standardised(trajectories, int(space.n))
         if len({len(each) for each in trajectories}) == 1 and not any(each.terminated for each in trajectories):
             options = replace(options, constant=False)
         observed = np.concatenate([trajectory.states for trajectory in trajectories])

@@ -102,6 +102,8 @@ class RadialBasisOptions:
       constant: whether φ(s) has a constant feature too, which gives the utility of a state as much prior variance as
         the others give it in the mean. Then how long a trajectory is counts by itself.
       diffusion: whether φ(s) of discrete states is a `DiffusionBasis` of the observed steps instead of one-hot.
+      standardised: whether the one-hot φ(s) of discrete states is divided by how much the number of their visits varies
+        between trajectories.
     """
 
     centres: int
@@ -110,6 +112,7 @@ class RadialBasisOptions:
     normalised: bool = False
     constant: bool = False
     diffusion: bool = False
+    standardised: bool = False
 
     def __post_init__(self) -> None:
         whole("centres", self.centres)

@@ -48,6 +48,8 @@ class Features:
         before the time limit.
       diffusion_utility: whether the utility of discrete states is smooth over the steps that were observed, with a
         length scale that is inferred, as in `DiffusionBasis`; else it has an independent value for each state.
+      standardised_utility: whether discrete states have the same part in the utility a priori however often
+        trajectories visit them, as in `RadialBasisOptions`; else each visit has.
     """
 
     features: str = "drawn"
@@ -57,13 +59,14 @@ class Features:
     normalised_utility: bool = True
     constant_utility: bool = False
     diffusion_utility: bool = False
+    standardised_utility: bool = False
 
     def __post_init__(self) -> None:
         checks.one_of("features", self.features, ("drawn", "other"))
         checks.whole("centres", self.centres)
         checks.positive("bandwidth_factor", self.bandwidth_factor)
         checks.positive("utility_bandwidth_factor", self.utility_bandwidth_factor)
-        for name in ("normalised_utility", "constant_utility", "diffusion_utility"):
+        for name in ("normalised_utility", "constant_utility", "diffusion_utility", "standardised_utility"):
             checks.boolean(name, getattr(self, name))
 
     @property
@@ -80,6 +83,7 @@ class Features:
             normalised=self.normalised_utility,
             constant=self.constant_utility,
             diffusion=self.diffusion_utility,
+            standardised=self.standardised_utility,
         )
 
 

@@ -9,14 +9,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 from jaxtyping import Float
 
 from bayespbrl.envs.stepping import random_episodes, step_limit
 
-# Trajectories of an iteration where actions are continuous; steps that the first ones should have in all, and the most
-# trajectories that an iteration may take for them.
-TRAJECTORIES, LEAST_STEPS, MOST_TRAJECTORIES = 10, 400, 100
+# Trajectories of an iteration where actions are continuous, and where they are discrete; steps that the first ones
+# should have in all, and where states are discrete; and the most trajectories that an iteration may take for them.
+TRAJECTORIES, OF_DISCRETE_ACTIONS = 10, 20
+LEAST_STEPS, LEAST_OF_DISCRETE_STATES, MOST_TRAJECTORIES = 400, 800, 100
 # Random actions end no episode if these take at least such a share of the horizon; and how many of them an episode has
 # at least, however long they are repeated.
 NEARLY_ALL, LEAST_DRAWS = 0.9, 10
@@ -53,29 +54,33 @@ class Task:
         functions are as fine as half the median rule, which learns Pendulum in half the iterations. Discrete actions
         have features of their own each, so there are fewer centres and more trajectories (CartPole); whether such a
         policy fails in an episode is a matter of luck, so more of them check it. A policy of discrete states, a table,
-        is not stuck, and is not started anew.
+        is not stuck, and is not started anew; its Q is a table too, and forgets nothing by old transitions.
         """
         continuous = isinstance(self.action_space, Box)
         dimensions = self.observation_space.shape[0] if isinstance(self.observation_space, Box) else 0
-        return ({} if dimensions else {"restart_iterations": 0}) | {
+        table = {"restart_iterations": 0, "critic_iterations": None, "standardised_utility": True}
+        return ({} if dimensions else table) | {
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
-            "trajectories_per_iteration": TRAJECTORIES if continuous else 20,
+            "trajectories_per_iteration": TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS,
             "check_episodes": (8 if people else 32) if continuous else (40 if people else 100),
             "centres": 300 if continuous else 100,
             "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
         }
 
     def more_trajectories(self) -> dict[str, Any]:
-        """More trajectories an iteration where the first episodes of a task with continuous actions end at once.
+        """More trajectories an iteration where the first episodes end at once, if actions are continuous or states not.
 
         Decision: as many as have `LEAST_STEPS` steps, but at most `MOST_TRAJECTORIES`; from ten of four steps each
-        nothing is learned about InvertedPendulum.
+        nothing is learned about InvertedPendulum. Where states are discrete, goals may be rare (FrozenLake-v1).
         """
-        enough = LEAST_STEPS // TRAJECTORIES  # steps of an episode: of longer ones the usual number suffices
-        if self.random_episodes is None or not isinstance(self.action_space, Box) or self.horizon <= enough:
+        continuous, table = isinstance(self.action_space, Box), isinstance(self.observation_space, Discrete)
+        least = LEAST_STEPS if continuous else LEAST_OF_DISCRETE_STATES
+        # steps of an episode: of longer ones the usual number suffices
+        enough = least // (TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS)
+        if self.random_episodes is None or not (continuous or table) or self.horizon <= enough:
             return {}
-        wanted = math.ceil(LEAST_STEPS / _mean_steps(self.random_episodes(enough, 1)))
+        wanted = math.ceil(least / _mean_steps(self.random_episodes(enough, 1)))
         return {"trajectories_per_iteration": min(wanted, MOST_TRAJECTORIES)}
 
     def longer_hold(self) -> dict[str, Any]:
