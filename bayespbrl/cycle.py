@@ -156,7 +156,7 @@ class Cycle:
         signal = None if state.bound is None else state.bound.signal
         if options.skips(state.preferences, state.unasked, state.estimate, signal):
             return questions.Chosen()
-        ties = 0 if state.preferences.pairs else state.preferences.answers
+        ties = state.preferences.answers if options.informative_ties and not state.preferences.pairs else 0
         it = QuerySituation(new, known, state.shown, standing[-1], state.estimate, signal, rng, against, standing, ties)
         return questions.later_questions(self.query_rule, it, options, answers=state.preferences.answers)
 

@@ -40,7 +40,7 @@ class QuerySituation:
       incumbent: number of the newest undominated one.
       opponents: whom a trajectory would be compared with, by number; the incumbent where it names none.
       undominated: numbers of all that no answer puts below another, about which no question is asked.
-      only_ties: number of answers so far where all are ties; 0 where one is not.
+      only_ties: number of answers so far where all are ties and ties are informative; else 0.
       estimate: the utility estimate of the last iteration.
       signal: of the last iteration's bound; None where the schedule has none.
       rng: of everything random.
@@ -72,9 +72,8 @@ class QuerySituation:
     def informed(self) -> tuple[Float[np.ndarray, "s n"], Float[np.ndarray, " n"]]:
         """`draws` of the new trajectories, and `information`.
 
-        Decision: a tie counts as an answer only from `ONLY_TIES` on. Where goals are seldom reached, as on
-        FrozenLake-v1, it is what tells a trajectory that reached one from all others; where some answers order
-        trajectories, which of two is better tells more.
+        Decision: a tie counts as an answer only after `ONLY_TIES` and nothing else. Where goals are seldom reached, as
+        on FrozenLake-v1, it is what tells a trajectory that reached one from all others.
         """
         utilities, opponents = self.draws()
         thresholds = self.estimate.tie_thresholds(QUERY_DRAWS) if self.only_ties >= ONLY_TIES else None

@@ -34,6 +34,8 @@ class Questions:
       answers: the budget: most answers of the run, ties included; None for no limit.
       same_start: whether a newcomer is compared with a trajectory from the same start, where there is one: the better
         of two unlike starts says little about a policy. The paper compares it with the best of all.
+      informative_ties: whether, while all answers are ties, it counts as information whether the next is one
+        (`queries.ONLY_TIES`).
       worthwhile: whether a question is left out whose answer is expected to tell less than `LEAST_INFORMATION`.
       clip_steps: length of the part of each trajectory, drawn at random, that questions are about; None: all of it. A
         person sees a part in seconds.
@@ -49,6 +51,7 @@ class Questions:
     unasked_iterations: int = 0
     answers: int | None = None
     same_start: bool = False
+    informative_ties: bool = False
     worthwhile: bool = False
     clip_steps: int | None = None
     repeats: float = 0.0
@@ -62,7 +65,7 @@ class Questions:
         checks.share("repeats", self.repeats, below_one=True)
         checks.optional(checks.whole, "answers", self.answers)
         checks.optional(checks.whole, "clip_steps", self.clip_steps)
-        for name in ("same_start", "worthwhile", "shared_repeats"):
+        for name in ("same_start", "informative_ties", "worthwhile", "shared_repeats"):
             checks.boolean(name, getattr(self, name))
         if self.shared_repeats and not self.repeats:
             raise ValueError("shared_repeats: expected false without repeats, got true")

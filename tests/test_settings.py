@@ -52,6 +52,7 @@ BAD = {
     "constant_utility": [None, 1, "yes"],
     "diffusion_utility": [None, 1, "yes"],
     "standardised_utility": [None, 1, "yes"],
+    "informative_ties": [None, 1, "yes"],
     "preset": ["fast", "", None],
     "answers": [0, -1, 2.5, True],
     "same_start": [None, 1, "yes"],
@@ -174,15 +175,21 @@ def test_where_states_are_discrete_goals_may_be_rare():
     def options(env, task):
         settings = settings_for(env, task=task)
         number, critic = settings.rollouts.trajectories_per_iteration, settings.update.critic_iterations
-        return settings.features.standardised_utility, critic, settings.update.restart_iterations, number
+        rare = (settings.features.standardised_utility, settings.questions.informative_ties)
+        return rare, critic, settings.update.restart_iterations, number
 
     short = [np.zeros(9)] * 2
     table = Task(Discrete(16), Discrete(4), horizon=100, random_episodes=lambda most, hold: short)
-    assert options("SomebodysEnv-v3", table) == (True, None, 0, 100)
+    assert options("SomebodysEnv-v3", table) == ((True, True), None, 0, 100)
     longer = replace(table, random_episodes=lambda most, hold: [np.zeros(min(most, 50) + 1)])
-    assert options("SomebodysEnv-v3", longer) == (True, None, 0, 20)
-    assert options("SomebodysEnv-v3", replace(table, observation_space=Box(-1.0, 1.0, (2,)))) == (False, 4, 8, 20)
-    assert options("gridworld", table) == (False, 4, 0, 10)  # as its figures were measured
+    assert options("SomebodysEnv-v3", longer) == ((True, True), None, 0, 20)
+    assert options("SomebodysEnv-v3", replace(table, observation_space=Box(-1.0, 1.0, (2,)))) == (
+        (False, False),
+        4,
+        8,
+        20,
+    )
+    assert options("gridworld", table) == ((False, False), 4, 0, 10)  # as its figures were measured
 
 
 def measured(spreads, steps=100, actions=None):

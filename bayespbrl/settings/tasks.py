@@ -58,8 +58,9 @@ class Task:
         """
         continuous = isinstance(self.action_space, Box)
         dimensions = self.observation_space.shape[0] if isinstance(self.observation_space, Box) else 0
-        table = {"restart_iterations": 0, "critic_iterations": None, "standardised_utility": True}
-        return ({} if dimensions else table) | {
+        table = {"restart_iterations": 0, "critic_iterations": None}
+        rare_goals = {"standardised_utility": True, "informative_ties": True}
+        return ({} if dimensions else table | rare_goals) | {
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
             "trajectories_per_iteration": TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS,
