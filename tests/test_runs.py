@@ -325,6 +325,15 @@ def test_a_run_in_progress_can_be_read_at_any_time(tmp_path):
     assert states == [(0, 0, 0), (0, 0, 10), (1, 0, 10), (2, 1, 10), (3, 2, 20), (4, 3, 30)]
 
 
+def test_a_run_of_discrete_states_keeps_the_standardised_features_of_its_utility(tmp_path):
+    options = {"answers": 3, "iterations": 2, "max_steps": 20, "evaluation_episodes": 2, "check_episodes": 2, "seed": 3}
+    learner = bayespbrl.start("FrozenLake-v1", tmp_path / "run", **options).run(ReturnExpert())
+    estimate = runs.load(tmp_path / "run").estimate
+    assert np.ptp(estimate.features.lengths) > 1
+    states = np.arange(16)
+    np.testing.assert_array_equal(estimate.utilities(states), learner.estimate.utilities(states))
+
+
 def test_a_finished_run_is_finished_when_resumed(copy):
     before = contents(copy)
     learner = runs.resume(copy)

@@ -21,18 +21,18 @@ class OneHot:
 
     Attributes:
       number_of_states: S.
-      scales: c of φ(s) = c_s e_s, or one number for all.
+      lengths: c of φ(s) = c_s e_s, or one number for all.
     """
 
     number_of_states: int
-    scales: Float[np.ndarray, " s"] | float = 1.0
+    lengths: Float[np.ndarray, " s"] | float = 1.0
 
     def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n {self.number_of_states}"]:
         """Features of N integer observations."""
         observations = indices("observations", observations, self.number_of_states)
         features = np.zeros((len(observations), self.number_of_states))
-        scales = np.broadcast_to(self.scales, self.number_of_states)
-        features[np.arange(len(observations)), observations] = scales[observations]
+        lengths = np.broadcast_to(self.lengths, self.number_of_states)
+        features[np.arange(len(observations)), observations] = lengths[observations]
         return features
 
 

@@ -14,7 +14,7 @@ from bayespbrl.events import Entry
 from bayespbrl.features import StateFeatures, checked_features
 from bayespbrl.models import restored, stored
 from bayespbrl.runs.files import NETCDF, check_file, write_netcdf
-from bayespbrl.runs.stored_classes import from_tree, to_tree
+from bayespbrl.runs.stored_classes import NAMES, from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import UtilityEstimate
 
@@ -134,7 +134,10 @@ def _estimate_groups(estimate: UtilityEstimate) -> dict[str, xr.DataTree]:
     """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
     try:
         groups = {"utility": to_tree(estimate, without=("posterior",))}
-    except ValueError:  # φ is a function of the user's, which has to be passed again
+    except ValueError:
+        if type(getattr(estimate, "features", None)) in NAMES:
+            raise
+        # φ is a function of the user's, which has to be passed again
         groups = {"utility": to_tree(estimate, without=("posterior", "features"))}
         groups["utility"].attrs["features"] = "other"
     if estimate.posterior is not None:
