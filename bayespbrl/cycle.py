@@ -158,7 +158,7 @@ class Cycle:
             return questions.Chosen()
         ties = state.preferences.answers if options.informative_ties and not state.preferences.pairs else 0
         it = QuerySituation(new, known, state.shown, standing[-1], state.estimate, signal, rng, against, standing, ties)
-        return questions.later_questions(self.query_rule, it, options, answers=state.preferences.answers)
+        return questions.later_questions(self.query_rule, it, options, preferences=state.preferences)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""

@@ -127,15 +127,17 @@ def first_questions(
     return Chosen(wanted, candidates, tuple(opponents[n] for n in candidates) if pairs else None)
 
 
-def later_questions(rule: QueryRule, situation: QuerySituation, options: Questions, *, answers: int) -> Chosen:
-    """The questions that `rule` chooses after `answers` answers; none where the best is not worth asking."""
+def later_questions(
+    rule: QueryRule, situation: QuerySituation, options: Questions, *, preferences: Preferences
+) -> Chosen:
+    """The questions that `rule` chooses; none where the best is not worth asking, once an answer stated an order."""
     order, opponents, information = candidates(rule, situation), None, None
     if options.same_start:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)
     if situation.estimate.posterior is not None:
         information = float(replace(situation, new=order[:1]).information()[0])
-    worth = not options.worthwhile or information is None or information >= LEAST_INFORMATION
-    wanted = options.within_budget(options.queries_per_iteration, answers) if worth else 0
+    worth = not (options.worthwhile and preferences.pairs) or information is None or information >= LEAST_INFORMATION
+    wanted = options.within_budget(options.queries_per_iteration, preferences.answers) if worth else 0
     return Chosen(wanted, order, opponents, information)
 
 

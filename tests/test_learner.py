@@ -788,6 +788,20 @@ def test_a_run_follows_a_query_rule_of_the_users_own_and_goes_on_with_it(tmp_pat
         Learner("gridworld", query="other")
 
 
+@pytest.mark.parametrize("informative", [True, False])
+def test_a_rule_is_told_of_answers_that_are_all_ties_where_ties_are_informative(informative):
+    seen = []
+
+    def rule(situation):
+        seen.append(situation.only_ties)
+        return newest_first(situation)
+
+    answers = iter(["tie", "tie", "tie", "first", "tie"])
+    run = learner(**(DRAWS | {"iterations": 4}), query=rule, informative_ties=informative)
+    run.run(lambda first, second: next(answers))
+    assert seen == ([2, 3, 0] if informative else [0, 0, 0])
+
+
 def everything(situation):
     return [situation.incumbent, *range(len(situation.trajectories) - 1, situation.incumbent, -1)]
 

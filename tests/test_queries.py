@@ -299,15 +299,18 @@ def test_the_first_questions_are_about_each_pair_from_one_start_once():
 
 
 def test_a_question_is_left_out_whose_answer_would_tell_nothing():
-    def chosen(draws, **options):
+    known, unknown = Preferences(((0, 1),), (0,), 4), Preferences((), (0, 1), 4)
+
+    def chosen(draws, after=known, **options):
         given = situation(draws, ZERO)
         given.estimate.posterior = "drawn"
-        return later_questions(QUERY_RULES["information"], given, Questions(**options), answers=4)
+        return later_questions(QUERY_RULES["information"], given, Questions(**options), preferences=after)
 
     foreseeable = np.full((4, 3), 9.0)
     assert chosen(foreseeable).wanted == 1
     worthless = chosen(foreseeable, worthwhile=True)
     assert (worthless.wanted, worthless.information) == (0, pytest.approx(0, abs=1e-9))
+    assert chosen(foreseeable, unknown, worthwhile=True).wanted == 1
     open_one = chosen(DRAWS, worthwhile=True)
     assert open_one.wanted == 1
     assert open_one.information > LEAST_INFORMATION
@@ -321,7 +324,8 @@ def test_nothing_is_asked_once_the_budget_is_spent():
     several = Questions(answers=3, queries_per_iteration=4)
     assert [several.within_budget(4, answers) for answers in (0, 1, 2, 3, 9)] == [3, 2, 1, 0, 0]
     given = situation(DRAWS, ZERO)
-    assert later_questions(QUERY_RULES["information"], given, several, answers=1).wanted == 2
+    after = Preferences(((0, 1),), (0,), 1)
+    assert later_questions(QUERY_RULES["information"], given, several, preferences=after).wanted == 2
 
 
 @pytest.mark.parametrize(("signal", "sure"), [(0.49, False), (0.51, True)])

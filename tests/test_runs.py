@@ -22,9 +22,12 @@ from toys import QUICK, Odd, Slope, fingerprint
 
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert
+from bayespbrl.diagnostics.report import tables as report_tables
 from bayespbrl.diagnostics.report import write_report
+from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.envs.opening import given_by_name, open_environment
 from bayespbrl.envs.stepping import step_limit
+from bayespbrl.features import OneHot, drawn
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.runs import directory as run_directory
 from bayespbrl.runs import run as runs
@@ -326,12 +329,23 @@ def test_a_run_in_progress_can_be_read_at_any_time(tmp_path):
 
 
 def test_a_run_of_discrete_states_keeps_the_standardised_features_of_its_utility(tmp_path):
-    options = {"answers": 3, "iterations": 2, "max_steps": 20, "evaluation_episodes": 2, "check_episodes": 2, "seed": 3}
+    options = {"answers": 3, "iterations": 2, "max_steps": 4, "evaluation_episodes": 2, "check_episodes": 2, "seed": 3}
     learner = bayespbrl.start("FrozenLake-v1", tmp_path / "run", **options).run(ReturnExpert())
     estimate = runs.load(tmp_path / "run").estimate
     assert np.ptp(estimate.features.lengths) > 1
     states = np.arange(16)
     np.testing.assert_array_equal(estimate.utilities(states), learner.estimate.utilities(states))
+    states, visits = report_tables.utility_table(read_contents(tmp_path / "run")), np.zeros(16, int)
+    for trajectory in learner.trajectories:
+        np.add.at(visits, trajectory.states, 1)
+    assert 0 < np.count_nonzero(visits) < 16
+    np.testing.assert_array_equal(states["reached"], visits > 0)
+
+
+def test_features_of_ours_that_cannot_be_stored_are_an_error_and_not_taken_for_the_users(tmp_path, monkeypatch):
+    monkeypatch.setattr(drawn, "standardised", lambda trajectories, number: OneHot(number, [1.0] * number))
+    with pytest.raises(ValueError, match="lengths"):
+        bayespbrl.start("FrozenLake-v1", tmp_path / "run", answers=3, iterations=2, max_steps=4).run(ReturnExpert())
 
 
 def test_a_finished_run_is_finished_when_resumed(copy):

@@ -189,7 +189,16 @@ def test_where_states_are_discrete_goals_may_be_rare():
         8,
         20,
     )
+    assert options("SomebodysEnv-v3", replace(longer, horizon=10)) == ((True, True), None, 0, 80)
     assert options("gridworld", table) == ((False, False), 4, 0, 10)  # as its figures were measured
+
+
+def test_discrete_states_have_one_kind_of_features():
+    table = Task(Discrete(16), Discrete(4), horizon=100)
+    features = settings_for("SomebodysEnv-v3", task=table, diffusion_utility=True).features
+    assert (features.diffusion_utility, features.standardised_utility) == (True, False)
+    with pytest.raises(ValueError, match="standardised_utility: expected false with diffusion_utility, got true"):
+        settings_for("SomebodysEnv-v3", diffusion_utility=True, standardised_utility=True)
 
 
 def measured(spreads, steps=100, actions=None):
@@ -222,7 +231,8 @@ def test_random_actions_are_repeated_for_as_many_steps_as_spread_all_dimensions_
         (8, {}, {}, 50),
         (1, {}, {}, 100),
         (8, {"action_space": Discrete(2)}, {}, 20),
-        (8, {"horizon": 40}, {}, 10),  # no longer than that if nothing ends it
+        (8, {"horizon": 40}, {}, 50),
+        (100, {"horizon": 5}, {}, 80),  # nothing ends them but the limit
         (8, {}, {"trajectories_per_iteration": 12}, 12),
         (8, {}, {"preset": "paper"}, 10),
     ],

@@ -130,8 +130,12 @@ def step_utilities(
     """uᵢ of each transition, and under S posterior draws: at most `draws`, None where there are none."""
     if not draws or utility.posterior is None:
         return utility.step_utilities(steps), None
-    utilities, drawn = utility.utilities_and_draws(steps.next_states, number=draws)
-    return utilities, drawn.T
+    if steps.next_states.ndim > 1:
+        utilities, drawn = utility.utilities_and_draws(steps.next_states, number=draws)
+        return utilities, drawn.T
+    reached, number = np.unique(steps.next_states, return_inverse=True)  # discrete: each is evaluated once
+    utilities, drawn = utility.utilities_and_draws(reached, number=draws)
+    return utilities[number], drawn[:, number].T
 
 
 def recent(trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iteration: int) -> Sequence[Trajectory]:

@@ -68,6 +68,8 @@ class Features:
         checks.positive("utility_bandwidth_factor", self.utility_bandwidth_factor)
         for name in ("normalised_utility", "constant_utility", "diffusion_utility", "standardised_utility"):
             checks.boolean(name, getattr(self, name))
+        if self.diffusion_utility and self.standardised_utility:
+            raise ValueError("standardised_utility: expected false with diffusion_utility, got true")
 
     @property
     def of_critic(self) -> RadialBasisOptions:

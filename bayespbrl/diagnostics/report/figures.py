@@ -126,7 +126,7 @@ def plot_states(table: xr.Dataset, values: np.ndarray, axes: Axes, *, label: str
 
 
 def plot_state_bands(table: xr.Dataset, axes: Axes) -> Axes:
-    """Mean utility ± two standard deviations of states in a list or on a line."""
+    """Mean utility ± two standard deviations of states on a line, or of those in a list that were visited."""
     states, certain = table["states"].values.reshape(table.sizes["state"]), "sd" not in table
     mean = table["used" if certain else "mean"].values
     sd = np.zeros(len(mean)) if certain else table["sd"].values
@@ -134,6 +134,8 @@ def plot_state_bands(table: xr.Dataset, axes: Axes) -> Axes:
         axes.fill_between(states, mean - 2 * sd, mean + 2 * sd, alpha=0.25, linewidth=0, label="± 2 sd")
         axes.plot(states, mean, color=MAIN, label="mean")
     else:
+        seen = table["reached"].values
+        states, mean, sd = states[seen], mean[seen], sd[seen]
         axes.errorbar(states, mean, yerr=2 * sd, fmt="o", markersize=4, capsize=2, color=MAIN, label="mean ± 2 sd")
     axes.axhline(0, color="0.6", linewidth=0.8)
     place = "observation 0" if table.attrs["kind"] == "line" else "state"

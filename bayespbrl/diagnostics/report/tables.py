@@ -130,8 +130,8 @@ def utility_table(contents: RunContents) -> xr.Dataset:
     Returns:
       along `state`: `used`, the utility that the learner used; where there is a posterior, its `mean` and `sd`,
       `prior_sd`, and `draws` (draw, state), three of them; `states`, the observations; `visits`, how often each was
-      seen (discrete states); `reached`, whether φ is more than a hundredth of its largest length, as it is near some
-      centre.
+      seen (discrete states); `reached`, whether it was (discrete states) or φ is more than a hundredth of its largest
+      length, as it is near some centre.
 
       The attribute `kind` says what the states are: `grid` (the cells, row by row, of an environment with a
       `grid_shape`), `list` (discrete), `line` and `plane` (evenly spaced over what was observed in one or two
@@ -148,12 +148,14 @@ def utility_table(contents: RunContents) -> xr.Dataset:
         raise ValueError("utility: expected an estimate of the utility of states, got none")
     states = np.concatenate([trajectory.states for trajectory in contents.trajectories.values()])
     shown, attrs = _states_to_show(contents, states, np.random.default_rng(0))
-    lengths = np.linalg.norm(estimate.features(shown), axis=1)
     data: Variables = {"used": ("state", estimate.utilities(shown))}
-    data["reached"] = ("state", lengths > 0.01 * np.max(lengths, initial=0.0))
     data["states"] = (("state",) if shown.ndim == 1 else ("state", "observation"), shown)
     if states.ndim == 1:
-        data["visits"] = ("state", np.bincount(states, minlength=len(shown)))
+        visits = np.bincount(states, minlength=len(shown))
+        data |= {"visits": ("state", visits), "reached": ("state", visits > 0)}
+    else:
+        lengths = np.linalg.norm(estimate.features(shown), axis=1)
+        data["reached"] = ("state", lengths > 0.01 * np.max(lengths, initial=0.0))
     if estimate.posterior is not None:
         _, draws = estimate.utilities_and_draws(shown, number=DRAWS)
         chosen = np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)

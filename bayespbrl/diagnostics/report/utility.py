@@ -121,7 +121,8 @@ def _maps(table: xr.Dataset) -> list[Picture]:
             shown.append(used)
             caption += " The learner acted on the fourth map."
     if np.isnan(blank).any():
-        caption += " Grey: where the features, and with them the utility, are nearly zero."
+        near_zero = "where the features, and with them the utility, are nearly zero"
+        caption += f" Grey: {'states that no trajectory visited' if 'visits' in table else near_zero}."
     panels = [
         (title, partial(figures.plot_states, table, table[name].values + blank, label=label, cmap=colours))
         for name, title, label, colours in shown
@@ -132,10 +133,10 @@ def _maps(table: xr.Dataset) -> list[Picture]:
 
 
 def _draws(table: xr.Dataset, blank: np.ndarray, where: str) -> Picture:
-    draws = table["draws"].values
-    limits: dict[str, Any] = {"vmin": float(draws.min()), "vmax": float(draws.max()), "cmap": "viridis"}
+    draws = table["draws"].values + blank
+    limits: dict[str, Any] = {"vmin": np.nanmin(draws), "vmax": np.nanmax(draws), "cmap": "viridis"}
     panels = [
-        (f"Draw {i + 1}", partial(figures.plot_states, table, draw + blank, label="utility", **limits))
+        (f"Draw {i + 1}", partial(figures.plot_states, table, draw, label="utility", **limits))
         for i, draw in enumerate(draws)
     ]
     caption = "Three posterior draws on one scale. Where they agree, the utility is well determined."
