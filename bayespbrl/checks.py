@@ -71,6 +71,12 @@ def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     return str(value)
 
 
+def function(name: str, value: Any, of: str = "") -> None:
+    """`value` can be called, and is no class, which a user may pass for its instance; `of` says what it takes."""
+    if not callable(value) or isinstance(value, type):
+        raise ValueError(f"{name}: expected a function{of}, got {value!r}")
+
+
 Choice = TypeVar("Choice")
 
 

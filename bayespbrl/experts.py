@@ -54,8 +54,7 @@ class NoisyExpert:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not callable(self.expert):
-            raise ValueError(f"expert: expected a function of two trajectories, got {self.expert!r}")
+        checks.function("expert", self.expert, " of two trajectories")
         checks.share("wrong_answers", self.wrong_answers)
         checks.seed(self.seed)
 

@@ -65,10 +65,8 @@ class Learner:
         self.environment = opening.open_environment(env)
         self.given = env if isinstance(env, gymnasium.Env) else opening.as_given(self.environment)
         for name, given in (("features", features), ("schedule", schedule), ("query", query)):
-            if given is not None and not callable(given) and (name == "features" or not isinstance(given, str)):
-                raise ValueError(
-                    f"{name}: expected a function{'' if name == 'features' else ' or a name'}, got {given!r}"
-                )
+            if given is not None and (name == "features" or not isinstance(given, str)):
+                checks.function(name, given, "" if name == "features" else " or a name")
         if policy is not None and (isinstance(policy, type) or not isinstance(policy, str | Policy)):
             raise ValueError(f"policy: expected {expected_policy(policy)}")
         if "environment" in options:
@@ -276,8 +274,8 @@ class Learner:
             that waits for another person is left open.
           progress: called after each iteration, those that ask nothing among them.
         """
-        if not callable(expert) or isinstance(expert, type):
-            raise ValueError(f"expert: expected a function of two trajectories, got {expert!r}")
+        checks.function("expert", expert, " of two trajectories")
+        checks.optional(checks.function, "progress", progress, of=" of the learner")
         checks.optional(checks.short_name, "answerer", answerer)
         self._advance(progress)
         vain = 0

@@ -153,7 +153,8 @@ class Preferences:
         """The preferences after one comparison of a newcomer with an incumbent.
 
         A better newcomer is preferred over every rival and replaces them. Over a worse one, every rival is preferred.
-        In a tie (`preferred=None`) the newcomer joins them, and the pair is a tie.
+        In a tie (`preferred=None`) the newcomer joins them, and the pair is a tie. So ties count as equal, and after
+        some of them one answer states several pairs, of which only one was shown.
 
         Where several people answer at once, or several questions of an iteration have one opponent, an incumbent may
         have become dominated. Then the answer is about the two alone, and only a better newcomer becomes undominated.

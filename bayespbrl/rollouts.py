@@ -70,8 +70,9 @@ def rollout(
       key: JAX random key; it decides everything, resets included.
       episodes: number of episodes, ≥ 1.
       max_steps: time limit; by default the environment's own.
-      hold: steps for which the policy's random key stays the same, ≥ 1. Each action still follows the policy at its
-        state. Noise that neighbouring steps share leads further away than noise that averages out.
+      hold: steps for which the policy's random key stays the same, ≥ 1; where dynamics are compiled, the first block of
+        an episode is shorter, at random. Each action still follows the policy at its state. Noise that neighbouring
+        steps share leads further away than noise that averages out.
       starts: a seed for the reset of each episode; None: `key` decides on them. An environment that is stepped by the
         gymnasium interface draws its own noise by that seed too.
 

@@ -40,7 +40,7 @@ class Trajectory:
                 raise ValueError(f"trajectory: {name}: expected one entry for each step, got {given!r}")
             values = np.asarray(given)
             whole = values.dtype.kind in "iub" and (values.ndim == 2 or name == "rewards")
-            kept = values.astype(np.float64) if whole else values.view()
+            kept = np.array(values, dtype=np.float64 if whole else None)  # whose buffers may be filled anew
             kept.flags.writeable = False  # experts, query rules and schedules of the user's see what is learned from
             object.__setattr__(self, name, kept)  # how a frozen dataclass sets an attribute
         steps = len(self.actions)

@@ -31,7 +31,8 @@ class PolicyUpdate:
         a schedule of the user's. `Settings` checks it.
       updates_per_iteration: most updates of the policy from the same trajectories and utility, until it has moved by
         most of the bound. Each has the Q of the policy before it; all but the first hold a continuous policy's spread.
-        The paper's is 1.
+        The bound is that of each update: the last of several begins short of it and may go beyond, for Gaussians of one
+        spread up to 3.6 times. The paper's is 1.
       recent_iterations: number of last iterations whose states the update takes; None for all.
       critic_iterations: number of last iterations whose transitions LSTD takes, but at least `LEAST_TRANSITIONS` and at
         most `MOST_TRANSITIONS`; None for all, as in the paper. Old ones say little about the current policy.

@@ -128,6 +128,7 @@ class Improvement:
       policy: the new policy.
       q_function: Q that the last update follows, under the policy before it.
       reps: of the last update: sample weights, temperature, KL and its bound, feature gaps, rank, effective samples.
+        Where there was none, of the one that was proposed.
       updates: how many there were; 0 where REPS had nothing to gain, or failed.
       kl_fitted_policy: mean KL of the new policy from the old one over the states of the updates, nats.
       entropy: mean entropy of the new policy over the same states, nats.
@@ -235,7 +236,7 @@ def apply_update(
     Source: paper, eqs. 11-14.
     """
     policy, (states, visits) = proposed.policy, proposed.problem.visited
-    improved, number, moved = policy, 0, 0.0
+    improved, number, moved, applied = policy, 0, 0.0, None
     while number < checks.whole("updates", updates):
         if number:
             proposed = propose(improved, proposed.problem, key=jax.random.fold_in(key, number))
@@ -245,9 +246,10 @@ def apply_update(
         fit = getattr(improved, "fit_mean" if number and hasattr(type(improved), "fit_mean") else "fit")
         improved = fit(*proposed.samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)  # eq. 14
         moved = float(visits @ improved.kl_divergence(policy, states))
-        number += 1
+        number, applied = number + 1, (proposed, reps)
         if moved >= NEARLY * kl_bound:
             break
+    proposed, reps = applied or (proposed, reps)
     weights = proposed.q_functions.weights
     return Improvement(
         policy=improved,
