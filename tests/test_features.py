@@ -25,7 +25,7 @@ from bayespbrl.features import (
 from bayespbrl.kernels import ROWS_AT_A_TIME, median_bandwidths, radial_basis_row
 from bayespbrl.trajectories import Trajectory, trajectory_features
 from bayespbrl.utility import infer_utility
-from bayespbrl.utility.length_scales import settings, sums_under, values_under
+from bayespbrl.utility.length_scales import bandwidth_multiples, sums_under, values_under
 
 PERIOD = (2 * np.pi, np.inf)
 STATES = Box(-np.inf, np.inf, (2,))
@@ -385,7 +385,7 @@ def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, cons
     features = RadialBasis(rng.normal(size=(20, dimensions)), bandwidths, period, normalised, constant)
     states = rng.normal(size=(300, dimensions))
     states[:2] *= 1e4  # far from all centres, where every exponential is zero
-    multiples = settings(features, inferred=True, rng=rng)
+    multiples = bandwidth_multiples(features, inferred=True, rng=rng)
     weights = [rng.normal(size=(20 + (constant > 0), 1 + number % 3)) for number in range(len(multiples))]
     values = values_under(features, multiples, states, weights)
     path = Trajectory(states, np.zeros((299, 1)), np.zeros(299), False)
@@ -400,7 +400,7 @@ def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, cons
 def test_values_and_sums_are_the_same_to_the_last_bit_in_any_number_of_threads(monkeypatch):
     rng = np.random.default_rng(6)
     features = RadialBasis(rng.normal(size=(100, 2)), np.ones(2), np.full(2, np.inf), True, 0.1)
-    multiples = settings(features, inferred=True, rng=rng)
+    multiples = bandwidth_multiples(features, inferred=True, rng=rng)
     paths = [Trajectory(rng.normal(size=(n, 2)), np.zeros((n - 1, 1)), np.zeros(n - 1), False) for n in (2, 300, 700)]
     weights = [rng.normal(size=(101, 2)) for _ in multiples]
     found = []
@@ -415,7 +415,7 @@ def test_values_and_sums_are_the_same_to_the_last_bit_in_any_number_of_threads(m
 @pytest.mark.parametrize(("dimensions", "alone"), [(8, 16), (12, 24), (17, 24), (40, 24)])
 def test_in_many_dimensions_the_settings_of_the_prior_are_as_many_and_let_one_matter_alone(dimensions, alone):
     features = RadialBasis(np.zeros((3, dimensions)), np.ones(dimensions), np.full(dimensions, np.inf))
-    multiples = settings(features, inferred=True, rng=np.random.default_rng(0))
+    multiples = bandwidth_multiples(features, inferred=True, rng=np.random.default_rng(0))
     assert len(multiples) == len(np.unique(multiples, axis=0)) == 27
     assert {tuple(row) for row in multiples} >= {(multiple,) * dimensions for multiple in (1.0, 3.0, 9.0)}
     mattering = np.sum(multiples < 9.0, axis=1)

@@ -15,7 +15,7 @@ from bayespbrl.models.posterior_tree import bases_of
 from bayespbrl.trajectories import DISCOUNT
 from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
-from bayespbrl.utility.length_scales import settings, sums_under
+from bayespbrl.utility.length_scales import bandwidth_multiples, sums_under
 from bayespbrl.utility.point_estimates import KnownReward, LinearProgramUtility
 from bayespbrl.utility.posterior_utility import PosteriorUtility
 from bayespbrl.utility.quality import FitQuality
@@ -76,7 +76,7 @@ def estimate(
     if options.utility == "linear-program":
         return _by_linear_program(comparisons.feature_sums(features), comparisons, features)
     rng = np.random.default_rng([seed, 2])
-    multiples = settings(features, inferred=options.hyperparameters == "inferred", rng=rng)
+    multiples = bandwidth_multiples(features, inferred=options.hyperparameters == "inferred", rng=rng)
     sums = sums_under(features, multiples, comparisons.trajectories, discount=comparisons.discount)
     method, plain = options.utility, options.plain_draws
     return _by_posterior(sums, multiples, comparisons, features, method, model, seed, plain)
@@ -141,7 +141,7 @@ def infer_utility(
     model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold)
     if method == "linear-program":
         return _by_linear_program(sums, comparisons, chosen)
-    unscaled = settings(chosen, inferred=False, rng=np.random.default_rng(0))
+    unscaled = bandwidth_multiples(chosen, inferred=False, rng=np.random.default_rng(0))
     return _by_posterior([sums], unscaled, comparisons, chosen, method, model, seed)
 
 

@@ -26,7 +26,9 @@ MOST_SETTINGS = 27
 MANY = 6  # dimensions; beyond, the prior has settings in which one alone matters
 
 
-def settings(features: StateFeatures, *, inferred: bool, rng: np.random.Generator) -> Float[np.ndarray, "c s"]:
+def bandwidth_multiples(
+    features: StateFeatures, *, inferred: bool, rng: np.random.Generator
+) -> Float[np.ndarray, "c s"]:
     """Multiples of the bandwidths of φ, one row for each of C settings; one row of ones where nothing is inferred."""
     dimensions = len(features.bandwidths) if isinstance(features, RadialBasis | DiffusionBasis) else 0
     if not inferred or not dimensions:
