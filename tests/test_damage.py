@@ -15,6 +15,8 @@ from toys import Slope
 import bayespbrl
 from bayespbrl.diagnostics.report import write_report
 from bayespbrl.diagnostics.report.contents import read_contents
+from bayespbrl.improvement.schedules import ConfidenceBound
+from bayespbrl.queries import InformationWhenUnsure
 from bayespbrl.runs.directory import RunDirectory, read_summary
 from bayespbrl.studies.tables import collect
 
@@ -169,8 +171,8 @@ def test_a_file_that_claims_terabytes_is_refused_before_it_is_read(monkeypatch, 
 WRONG_KINDS = {
     "features": ["rbf", 3, np.zeros(3)],
     "policy": [3, object(), lambda states: 0],
-    "schedule": [0.3, np.zeros(2)],
-    "query": [3, ["information"]],
+    "schedule": [0.3, np.zeros(2), ConfidenceBound],
+    "query": [3, ["information"], InformationWhenUnsure],
 }
 
 

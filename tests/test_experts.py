@@ -215,6 +215,7 @@ def test_errors_are_a_function_of_the_two_trajectories_in_either_order(expert):
         (lambda: Teacher(rationality=None), "rationality: expected a number > 0"),
         (lambda: Teacher(least_return=None), "least_return: expected a number"),
         (lambda: NoisyExpert("return", 0.1), "expert: expected a function of two trajectories, got 'return'"),
+        (lambda: NoisyExpert(ReturnExpert, 0.1), "expert: expected a function of two trajectories, got <class"),
         (lambda: Teacher(discount=0), "discount"),
         (lambda: Teacher(least_return=np.nan), "least_return"),
         (lambda: Teacher(equal_within=-1), "equal_within"),

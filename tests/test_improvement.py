@@ -442,6 +442,25 @@ def test_where_reps_finds_nothing_the_policy_stays_as_it_is_and_does_not_narrow(
     assert (updated.updates, updated.kl_fitted_policy, updated.reps.bound_active) == (0, 0.0, False)
 
 
+@pytest.mark.parametrize("failure", [{"kl": 0.0}, {"converged": False}])
+def test_what_an_update_reports_is_of_the_last_that_was_applied(failure, monkeypatch):
+    policy, steps, options = few_samples()
+    utilities = steps.actions[:, 0] * np.sign(steps.states.prod(axis=1))  # a linear policy follows it in part
+    once = improve(policy, steps, utilities, **options)
+    solve, bounds = update.ProposedUpdate.solve, []
+
+    def only_the_first(self, kl_bound):
+        bounds.append(kl_bound)
+        return solve(self, kl_bound) if len(bounds) == 1 else replace(solve(self, kl_bound), **failure)
+
+    monkeypatch.setattr(update.ProposedUpdate, "solve", only_the_first)
+    twice = improve(policy, steps, utilities, updates=2, **options)
+    assert (len(bounds), twice.updates) == (2, 1)
+    assert twice.reps.converged
+    assert twice.summary() == once.summary()
+    np.testing.assert_array_equal(twice.q_function.weights, once.q_function.weights)
+
+
 def test_features_of_the_users_own_constrain_the_states_alike_in_any_units():
     policy, steps, options = few_samples()
 

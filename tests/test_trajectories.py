@@ -118,3 +118,4 @@ def test_what_is_learned_from_cannot_be_changed_in_place_and_the_callers_arrays_
         with pytest.raises(ValueError, match="read-only"):
             values -= 1
     states[0, 0] = 5.0
+    assert trajectory.states[0, 0] == 0.0
