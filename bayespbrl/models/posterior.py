@@ -60,6 +60,7 @@ def sample_posterior(
     """Draw from the posterior of the utility weights w ~ N(0, σ²I) given preferences (eqs. 7-8), until it converges.
 
     What is None is inferred with the weights, and so is which of several settings of the features explains the answers.
+    By default steepness and lapse rate are given, as in eq. 8; `infer_utility` and the learner infer both.
     The chains have converged when every margin, and all else that is inferred, has R̂ ≤ 1.01 and at least 400 effective
     draws. This is checked after `num_samples` draws a chain and after every doubling; where it is not met at
     `max_samples`, `converged` is 0. Everything is computed in float64.

@@ -20,7 +20,8 @@ from bayespbrl.models.priors import Grid
 class PreferenceModel:
     """Prior and likelihood (eqs. 7-8): w ~ N(0, σ²I), and the probability of an answer given its margin t = wᵀψ.
 
-    Without ties the answers depend on σ·m alone. What is None is inferred, with the priors of `priors`.
+    Without ties the answers depend on σ·m alone. What is None is inferred, with the priors of `priors`. By default
+    steepness and lapse rate are given, as in eq. 8; `infer_utility` and the learner infer both.
 
     Attributes:
       prior_scale: σ > 0, standard deviation of each weight, in utility per feature.
