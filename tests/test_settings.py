@@ -231,8 +231,7 @@ def test_random_actions_are_repeated_for_as_many_steps_as_spread_all_dimensions_
         (8, {}, {}, 50),
         (1, {}, {}, 100),
         (8, {"action_space": Discrete(2)}, {}, 20),
-        (8, {"horizon": 40}, {}, 50),
-        (100, {"horizon": 5}, {}, 80),  # nothing ends them but the limit
+        (8, {"horizon": 40}, {}, 10),  # no longer than that if nothing ends it
         (8, {}, {"trajectories_per_iteration": 12}, 12),
         (8, {}, {"preset": "paper"}, 10),
     ],

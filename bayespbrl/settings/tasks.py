@@ -73,14 +73,14 @@ class Task:
         """More trajectories an iteration where the first episodes end at once, if actions are continuous or states not.
 
         Decision: as many as have `LEAST_STEPS` steps, but at most `MOST_TRAJECTORIES`; from ten of four steps each
-        nothing is learned about InvertedPendulum. Where states are discrete, `LEAST_OF_DISCRETE_STATES`: goals may be
-        rare (FrozenLake-v1).
+        nothing is learned about InvertedPendulum. With a limit of 40 steps the usual number stays. Where states are
+        discrete, as have `LEAST_OF_DISCRETE_STATES`, whatever the limit: goals may be rare (FrozenLake-v1).
         """
         continuous, table = isinstance(self.action_space, Box), isinstance(self.observation_space, Discrete)
         least = LEAST_STEPS if continuous else LEAST_OF_DISCRETE_STATES
         # steps of an episode: of longer ones the usual number suffices
         enough = least // (TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS)
-        if self.random_episodes is None or not (continuous or table):
+        if self.random_episodes is None or not (continuous or table) or (continuous and self.horizon <= enough):
             return {}
         wanted = math.ceil(least / _mean_steps(self.random_episodes(min(enough, self.horizon), 1)))
         return {"trajectories_per_iteration": min(wanted, MOST_TRAJECTORIES)}
