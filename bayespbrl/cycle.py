@@ -149,16 +149,15 @@ class Cycle:
         options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)
         favourite = state.best if state.restart is None else min(state.restart.number, state.started - 1)
         new, best = range(len(state.trajectories), len(known)), self._of_iteration(favourite)
-        against = opponents_from_the_same_start(known, state.preferences, best) if options.same_start else {}
+        opponents = opponents_from_the_same_start(known, state.preferences, best) if options.same_start else {}
         standing = state.preferences.undominated
         if state.estimate is None or not standing:  # none: all were skipped
-            return questions.first_questions(new, against, options, rng=rng)
+            return questions.first_questions(new, opponents, options, rng=rng)
         signal = None if state.bound is None else state.bound.signal
         if options.skips(state.preferences, state.unasked, state.estimate, signal):
             return questions.Chosen()
-        ties = state.preferences.answers if options.informative_ties and not state.preferences.pairs else 0
-        it = QuerySituation(new, known, state.shown, standing[-1], state.estimate, signal, rng, against, standing, ties)
-        return questions.later_questions(self.query_rule, it, options, preferences=state.preferences)
+        given = QuerySituation(new, known, state.shown, standing[-1], state.estimate, signal, rng, opponents, standing)
+        return questions.later_questions(self.query_rule, given, options, preferences=state.preferences)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""

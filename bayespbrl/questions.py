@@ -131,6 +131,8 @@ def later_questions(
     rule: QueryRule, situation: QuerySituation, options: Questions, *, preferences: Preferences
 ) -> Chosen:
     """The questions that `rule` chooses; none where the best is not worth asking, once an answer stated an order."""
+    if options.informative_ties and not preferences.pairs:
+        situation = replace(situation, only_ties=preferences.answers)
     order, opponents, information = candidates(rule, situation), None, None
     if options.same_start:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)

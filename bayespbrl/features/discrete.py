@@ -73,10 +73,9 @@ def standardised(trajectories: Sequence[Trajectory], number_of_states: int) -> O
     Where weights are alike a priori, a goal that few trajectories reach, once each, would hardly count beside states in
     which they stay. What all visit equally often, or none, is divided by what one visit in all would give.
     """
-    visits = np.zeros((len(trajectories), number_of_states))
-    for row, trajectory in zip(visits, trajectories, strict=True):
-        states = indices("states", trajectory.states, number_of_states)
-        np.add.at(row, states[1:], 1.0)  # utilities are of the states that steps lead to
+    paths = [indices("states", trajectory.states, number_of_states) for trajectory in trajectories]
+    # utilities are of the states that steps lead to
+    visits = np.array([np.bincount(states[1:], minlength=number_of_states) for states in paths])
     deviations = np.sqrt(np.maximum(visits.var(axis=0), 1 / len(trajectories)))
     return OneHot(number_of_states, 1 / deviations)
 

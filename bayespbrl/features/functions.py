@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from bayespbrl.checks import dense
+from bayespbrl.checks import dense, function
 
 StateFeatures = Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
 StateActionFeatures = Callable[[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
@@ -14,8 +14,7 @@ StateActionFeatures = Callable[[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, 
 def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."]) -> Float[np.ndarray, "n d"]:
     """`features(states)` as finite float64 numbers of shape (N, D); `ValueError` where it is anything else."""
     name = getattr(features, "__name__", type(features).__name__)
-    if not callable(features):
-        raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
+    function("features", features, " of states (N, S)")
     values = dense(f"features {name}", features(np.array(states)))  # a copy, which the function may change
     if values.ndim != 2 or len(values) != len(states) or values.shape[1] == 0:
         raise ValueError(f"features {name}: expected shape ({len(states)}, D), got {values.shape}")

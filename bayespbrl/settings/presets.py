@@ -90,7 +90,7 @@ TASKS = {
     | {"updates_per_iteration": 3, "trajectories_per_iteration": 10, "check_episodes": check_episodes}
     for task, check_episodes in (("gridworld", 40), ("swing-up", 8), ("bicycle", 40), ("acrobot", 40))
 }
-# Not with what the default does since where states are discrete: its figures were measured before.
+# The Gridworld is without what the default has come to do where states are discrete: its figures are older.
 TASKS["gridworld"] |= {"critic_iterations": 4, "standardised_utility": False, "informative_ties": False}
 # An environment object of the user's is known by its gymnasium id.
 IDS = {identity: short for short, identity in SHORT_NAMES.items()}

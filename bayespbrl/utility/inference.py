@@ -210,6 +210,5 @@ def _as_they_are(states: np.ndarray) -> np.ndarray:
 
 def _checking(features: StateFeatures) -> StateFeatures:
     """φ of the user's with its values checked; ours check themselves, and their bandwidths are read."""
-    if not callable(features):
-        raise ValueError(f"features: expected a function of states (N, S), got {features!r}")
+    checks.function("features", features, " of states (N, S)")
     return features if isinstance(features, RadialBasis | DiffusionBasis) else partial(checked_features, features)
