@@ -24,7 +24,7 @@ from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, state
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.models.threads import one_blas_thread
-from bayespbrl.policies import Sampler, greedy
+from bayespbrl.policies import Policy, Sampler, greedy
 from bayespbrl.preferences import opponent_now, opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
 from bayespbrl.settings import Settings
@@ -34,10 +34,9 @@ from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.inference import estimate
 
 # Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT, CLIPS, CHECK = range(12)
+COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT, CLIPS, CHECK, NOISE_FREE = range(13)
 # Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
-HOLDS = 40  # of exploration, in an episode
 
 
 @dataclass(frozen=True)
@@ -100,18 +99,9 @@ class Cycle:
 
     def collect(self, state: LearnerState) -> Entry:
         """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
-        options, asking = self.settings.rollouts, self.settings.questions
         began, restarted = time.perf_counter(), state.restarts(self.settings)
-        collected = rollouts.rollout(
-            self.environment,
-            state.first_policy if restarted else state.policy,
-            key=self._key(COLLECT, state.iteration),
-            episodes=options.trajectories_per_iteration,
-            max_steps=options.max_steps,
-            hold=self._hold(state),
-            starts=self._starts(state.iteration) if asking.same_start else None,
-        )
-        clips = asking.clips(collected, rng=self._rng(CLIPS, state.iteration))
+        collected = self._collected(state, state.first_policy if restarted else state.policy)
+        clips = self.settings.questions.clips(collected, rng=self._rng(CLIPS, state.iteration))
         known = (*state.compared, *clips_of(collected, clips))
         chosen = self._chosen_questions(state, known)
         event = {
@@ -124,26 +114,28 @@ class Cycle:
         }
         return _entry(event, trajectories=collected)
 
+    def _collected(self, state: LearnerState, policy: Policy) -> tuple[Trajectory, ...]:
+        """New trajectories; the last of an updated policy is without its noise, where that is asked for."""
+        options, iteration = self.settings.rollouts, state.iteration
+        number = options.trajectories_per_iteration
+        noisy = number - (options.noise_free and iteration > 0)
+        first = [len(each) for each in state.trajectories[:number]]
+        hold = options.hold(first or [step_limit(self.environment, options.max_steps)])
+        starts = self._starts(iteration)[:noisy] if self.settings.questions.same_start else None
+        explored = self._roll(policy, self._key(COLLECT, iteration), noisy, hold=hold, starts=starts)
+        if noisy == number:
+            return explored
+        start = self.reset_seed(iteration * number + noisy)
+        return explored + self._roll(greedy(policy), self._key(NOISE_FREE, iteration), 1, starts=[start])
+
     def _tried(self, policy: Sampler) -> tuple[Trajectory, ...]:
         """Trajectories without the policy's noise, from starts that are the same for all policies of the run."""
-        if not self.settings.update.checked:
-            return ()
-        return rollouts.rollout(
-            self.environment,
-            greedy(policy),
-            key=self._key(CHECK, 0),
-            episodes=self.settings.update.check_episodes,
-            max_steps=self.settings.rollouts.max_steps,
-        )
+        options = self.settings.update
+        return self._roll(greedy(policy), self._key(CHECK, 0), options.check_episodes) if options.checked else ()
 
-    def _hold(self, state: LearnerState) -> int:
-        """For how many steps exploration is held: as set, or a share of an episode."""
-        options = self.settings.rollouts
-        if options.exploration_hold is not None:
-            return options.exploration_hold
-        first = [len(each) for each in state.trajectories[: options.trajectories_per_iteration]]
-        length = np.mean(first or [step_limit(self.environment, options.max_steps)])
-        return max(1, round(float(length) / HOLDS))
+    def _roll(self, policy: Sampler, key: jax.Array, episodes: int, **how: Any) -> tuple[Trajectory, ...]:
+        limit = self.settings.rollouts.max_steps
+        return rollouts.rollout(self.environment, policy, key=key, episodes=episodes, max_steps=limit, **how)
 
     def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> questions.Chosen:
         options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)
@@ -154,10 +146,11 @@ class Cycle:
         if state.estimate is None or not standing:  # none: all were skipped
             return questions.first_questions(new, opponents, options, rng=rng)
         signal = None if state.bound is None else state.bound.signal
-        if options.skips(state.preferences, state.unasked, state.estimate, signal):
-            return questions.Chosen()
-        given = QuerySituation(new, known, state.shown, standing[-1], state.estimate, signal, rng, opponents, standing)
-        return questions.later_questions(self.query_rule, given, options, preferences=state.preferences)
+        noise_free = new[-1] if self.settings.rollouts.noise_free else None
+        given = QuerySituation(
+            new, known, state.shown, standing[-1], state.estimate, signal, rng, opponents, standing, noise_free
+        )
+        return questions.later_questions(self.query_rule, given, options, state.preferences, unasked=state.unasked)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""

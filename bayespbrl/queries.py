@@ -27,6 +27,7 @@ QUERY_DRAWS = 500
 MOST_OLDER = 20  # their draws would soon cost more than all else
 # Answers of which all are ties: from so many on it counts as information whether the next is one too.
 ONLY_TIES = 4
+DOUBT = 0.25  # nats that an answer is expected to tell: one that the posterior foresees with less than some 0.9
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class QuerySituation:
       incumbent: number of the newest undominated one.
       opponents: whom a trajectory would be compared with, by number; the incumbent where it names none.
       undominated: numbers of all that no answer puts below another, about which no question is asked.
+      noise_free: number of the new one without the policy's noise; None where all have it.
       only_ties: number of answers so far where all are ties and ties are informative; else 0.
       estimate: the utility estimate of the last iteration.
       signal: of the last iteration's bound; None where the schedule has none.
@@ -55,6 +57,7 @@ class QuerySituation:
     rng: np.random.Generator
     opponents: Mapping[int, int] = field(default_factory=dict)
     undominated: Sequence[int] = ()
+    noise_free: int | None = None
     only_ties: int = 0
 
     def draws(self) -> tuple[Float[np.ndarray, "s n"], Float[np.ndarray, "s n"]]:
@@ -64,6 +67,17 @@ class QuerySituation:
         draws = self.estimate.trajectory_draws([self.trajectories[n] for n in numbers], number=QUERY_DRAWS)
         column = {number: position for position, number in enumerate(numbers)}
         return draws[:, [column[n] for n in self.new]], draws[:, [column[n] for n in against]]
+
+    def doubted(self) -> tuple[int, ...]:
+        """The trajectory without noise, where the answer about it would tell at least `DOUBT`; else none.
+
+        Decision: it is asked about then, whatever the rule. Without its noise a policy may stay where no trajectory
+        with it does (FrozenLake-v1 that does not slip), and a run keeps policies without.
+        """
+        if self.noise_free is None or self.estimate.posterior is None:
+            return ()
+        number = self.noise_free
+        return (number,) if replace(self, new=[number]).information()[0] >= DOUBT else ()
 
     def information(self) -> Float[np.ndarray, " n"]:
         """The `expected_information` of a question about each new trajectory."""

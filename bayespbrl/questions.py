@@ -128,12 +128,20 @@ def first_questions(
 
 
 def later_questions(
-    rule: QueryRule, situation: QuerySituation, options: Questions, *, preferences: Preferences
+    rule: QueryRule, situation: QuerySituation, options: Questions, preferences: Preferences, *, unasked: int
 ) -> Chosen:
-    """The questions that `rule` chooses; none where the best is not worth asking, once an answer stated an order."""
+    """The questions that `rule` chooses, after `unasked` iterations in a row without any.
+
+    None where the iteration skips them, or the best is not worth asking once an answer stated an order. First comes
+    the policy without its noise where the posterior is in doubt about it; then the iteration is not skipped.
+    """
     if options.informative_ties and not preferences.pairs:
         situation = replace(situation, only_ties=preferences.answers)
-    order, opponents, information = candidates(rule, situation), None, None
+    doubted = situation.doubted() if preferences.pairs and options.left(preferences.answers) > 0 else ()
+    if not doubted and options.skips(preferences, unasked, situation.estimate, situation.signal):
+        return Chosen()
+    others = (number for number in candidates(rule, situation) if number not in doubted)
+    order, opponents, information = (*doubted, *others), None, None
     if options.same_start:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)
     if situation.estimate.posterior is not None:

@@ -802,6 +802,28 @@ def test_a_rule_is_told_of_answers_that_are_all_ties_where_ties_are_informative(
     assert seen == ([2, 3, 0] if informative else [0, 0, 0])
 
 
+@pytest.mark.parametrize("same_start", [False, True])
+def test_the_last_trajectory_of_an_updated_policy_is_without_its_noise(same_start):
+    options = QUICK | {"max_steps": 30, "answers": 4, "trajectories_per_iteration": 4, "same_start": same_start}
+    log = Memory()
+    run = Learner("CartPole-v1", noise_free=True, **(options | {"iterations": 3})).logged(log)
+    run.run(ReturnExpert())
+    policies = [entry.parts["policy"] for entry in log.entries if entry.event["event"] == "improved"]
+
+    def as_most_probable(policy, trajectory):
+        return np.array_equal([policy.mode(state) for state in trajectory.states[:-1]], trajectory.actions)
+
+    for iteration, policy in zip((1, 2), policies, strict=False):
+        *noisy, last = run.trajectories[4 * iteration : 4 * iteration + 4]
+        assert as_most_probable(policy, last)
+        assert not all(as_most_probable(policy, each) for each in noisy)
+    assert not all(as_most_probable(run.state.first_policy, each) for each in run.trajectories[:4])
+    environment = gymnasium.make("CartPole-v1")
+    for number, trajectory in enumerate(run.trajectories):  # as a person sees it again
+        observation, _ = environment.reset(seed=run.cycle.reset_seed(number))
+        np.testing.assert_array_equal(observation, trajectory.states[0].astype(np.float32))
+
+
 def everything(situation):
     return [situation.incumbent, *range(len(situation.trajectories) - 1, situation.incumbent, -1)]
 

@@ -304,7 +304,7 @@ def test_a_question_is_left_out_whose_answer_would_tell_nothing():
     def chosen(draws, after=known, **options):
         given = situation(draws, ZERO)
         given.estimate.posterior = "drawn"
-        return later_questions(QUERY_RULES["information"], given, Questions(**options), preferences=after)
+        return later_questions(QUERY_RULES["information"], given, Questions(**options), after, unasked=0)
 
     foreseeable = np.full((4, 3), 9.0)
     assert chosen(foreseeable).wanted == 1
@@ -325,7 +325,36 @@ def test_nothing_is_asked_once_the_budget_is_spent():
     assert [several.within_budget(4, answers) for answers in (0, 1, 2, 3, 9)] == [3, 2, 1, 0, 0]
     given = situation(DRAWS, ZERO)
     after = Preferences(((0, 1),), (0,), 1)
-    assert later_questions(QUERY_RULES["information"], given, several, preferences=after).wanted == 2
+    assert later_questions(QUERY_RULES["information"], given, several, after, unasked=0).wanted == 2
+
+
+@pytest.mark.parametrize(
+    ("likely", "answers", "expected"),
+    [
+        (0.5, 8, (1, (2, 0, 1))),  # in doubt: first, and the iteration asks
+        (0.95, 8, (0, ())),  # foreseen: the signal is high, so the iteration asks nothing
+        (0.5, 20, (0, ())),  # the budget is spent
+    ],
+)
+def test_a_policy_without_its_noise_is_asked_about_while_the_posterior_doubts_it(likely, answers, expected):
+    """Trajectory 2 is without noise, 3 the incumbent; the rule by itself would ask about 0, 1, 2."""
+    better = np.where(np.arange(100) < 100 * likely, 9.0, -9.0)
+    draws = np.column_stack([np.full(100, 30.0), np.full(100, 20.0), better])
+    given = replace(situation(draws, np.zeros(100), signal=0.9), noise_free=2)
+    given.estimate.posterior, given.estimate.quality = "drawn", SimpleNamespace(converged=True)
+    options = Questions(unasked_iterations=4, answers=20, worthwhile=True)
+    chosen = later_questions(
+        QUERY_RULES["highest-utility"], given, options, Preferences(((0, 1),), (0,), answers), unasked=0
+    )
+    assert (chosen.wanted, chosen.candidates) == expected
+    without = later_questions(
+        QUERY_RULES["highest-utility"],
+        replace(given, noise_free=None),
+        options,
+        Preferences(((0, 1),), (0,), answers),
+        unasked=0,
+    )
+    assert without.wanted == 0
 
 
 @pytest.mark.parametrize(("signal", "sure"), [(0.49, False), (0.51, True)])

@@ -53,6 +53,7 @@ BAD = {
     "diffusion_utility": [None, 1, "yes"],
     "standardised_utility": [None, 1, "yes"],
     "informative_ties": [None, 1, "yes"],
+    "noise_free": [None, 1, "yes"],
     "preset": ["fast", "", None],
     "answers": [0, -1, 2.5, True],
     "same_start": [None, 1, "yes"],
@@ -176,6 +177,7 @@ def test_where_states_are_discrete_goals_may_be_rare():
         settings = settings_for(env, task=task)
         number, critic = settings.rollouts.trajectories_per_iteration, settings.update.critic_iterations
         rare = (settings.features.standardised_utility, settings.questions.informative_ties)
+        assert settings.rollouts.noise_free == rare[0]
         return rare, critic, settings.update.restart_iterations, number
 
     short = [np.zeros(9)] * 2

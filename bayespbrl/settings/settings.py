@@ -3,7 +3,7 @@
 Users name an option alone: in keywords, on the command line, in `settings.json`. `OPTIONS` tells which part reads it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, cast
@@ -27,6 +27,7 @@ from bayespbrl.utility.inference import WITHOUT_POSTERIOR, Estimation
 
 LAST_ITERATIONS = 5  # after the last answer: the policy catches up with what is known
 INFERRED: dict[str, Any] = {"steepness": None, "lapse_rate": None}  # unless they or all hyperparameters are given
+HOLDS = 40  # of exploration, in an episode
 MOST_UNASKED = 10  # in a row; then more answers would change little
 MOST_STEPS = 10_000_000  # an episode
 MOST_TRAJECTORIES = 100_000  # an iteration; of a damaged or foreign run, they are room that is made
@@ -99,6 +100,8 @@ class Rollouts:
       exploration_hold: steps for which the exploring policy's random choice is held, so that the trajectories of an
         iteration differ; the paper's is 1. None: a fortieth of an episode, in the first iteration by the limit of
         steps, then by the mean length of the first trajectories, which may end early. Evaluations never hold it.
+      noise_free: whether the last trajectory of each iteration but the first follows the policy without its noise, as
+        the run keeps it. A question is about it where the posterior is in doubt (`queries.DOUBT`), whatever the rule.
       evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
       policy: the kind of policy. `auto` takes tabular for discrete states, softmax for discrete actions in continuous
         states, gaussian-process otherwise; `other` is a policy of the user's.
@@ -108,6 +111,7 @@ class Rollouts:
     trajectories_per_iteration: int = 10
     max_steps: int | None = None
     exploration_hold: int | None = 1
+    noise_free: bool = False
     evaluation_episodes: int = 100
     policy: str = "auto"
     initial_action_scale: float = 0.75
@@ -116,9 +120,16 @@ class Rollouts:
         checks.whole("trajectories_per_iteration", self.trajectories_per_iteration, 2, most=MOST_TRAJECTORIES)
         checks.optional(checks.whole, "max_steps", self.max_steps, most=MOST_STEPS)
         checks.optional(checks.whole, "exploration_hold", self.exploration_hold)
+        checks.boolean("noise_free", self.noise_free)
         checks.whole("evaluation_episodes", self.evaluation_episodes)
         checks.one_of("policy", self.policy, ("auto", *POLICIES, "other"))
         checks.positive("initial_action_scale", self.initial_action_scale)
+
+    def hold(self, lengths: Sequence[int]) -> int:
+        """For how many steps exploration is held: as set, or a share of episodes of these lengths."""
+        if self.exploration_hold is not None:
+            return self.exploration_hold
+        return max(1, round(float(np.mean(lengths)) / HOLDS))
 
 
 @dataclass(frozen=True)

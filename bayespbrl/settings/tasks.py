@@ -55,13 +55,15 @@ class Task:
         have features of their own each, so there are fewer centres and more trajectories (CartPole); whether such a
         policy fails in an episode is a matter of luck, so more of them check it. A policy of discrete states, a table,
         is not stuck, and is not started anew; its Q is a table too, and forgets nothing by old transitions. Its
-        goals may be rare: one that few trajectories reach counts as much, and ties tell of it.
+        goals may be rare: one that few trajectories reach counts as much, and ties tell of it. Without its noise it may
+        stay somewhere for good, which trajectories with it do not show.
         """
         continuous = isinstance(self.action_space, Box)
         dimensions = self.observation_space.shape[0] if isinstance(self.observation_space, Box) else 0
         of_a_table = {"restart_iterations": 0, "critic_iterations": None}
         of_rare_goals = {"standardised_utility": True, "informative_ties": True}
-        return ({} if dimensions else of_a_table | of_rare_goals) | {
+        where_one_stays = {"noise_free": True}
+        return ({} if dimensions else of_a_table | of_rare_goals | where_one_stays) | {
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
             "trajectories_per_iteration": TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS,
