@@ -148,7 +148,7 @@ def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
         first,
         key=restarted.learner.cycle._key(cycle.COLLECT, began),
         episodes=10,
-        hold=restarted.learner.cycle._hold(restarted.learner.state),
+        hold=restarted.learner.settings.rollouts.hold([len(each) for each in restarted.trajectories[:10]]),
         max_steps=8,
         starts=restarted.learner.cycle._starts(began),
     )
