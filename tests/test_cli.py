@@ -19,7 +19,9 @@ import xarray as xr
 import bayespbrl
 from bayespbrl.cli.commands import main
 from bayespbrl.cli.compiled import VARIABLE, keep_compiled
-from bayespbrl.cli.display import _again, show_trials
+from bayespbrl.cli.display import show_trials
+from bayespbrl.runs.directory import command_to_continue
+from bayespbrl.settings import Settings
 from bayespbrl.studies import Trials
 
 SHORT = ["--preset", "paper", "--utility", "linear-program", "--max-steps", "20"]
@@ -181,13 +183,9 @@ def test_a_run_without_a_simulated_expert_leaves_nothing_behind_but_what_was_the
 
 
 def test_the_command_that_continues_a_run_names_what_it_needs(tmp_path):
-    learner = mock.Mock()
-    learner.settings.env = "package:Env-v0"
-    assert (
-        _again("resume", learner, tmp_path, ["Ada"]) == f"bayespbrl resume {tmp_path} --answerer=Ada --import-package"
-    )
-    learner.settings.env = "Pendulum-v1"
-    assert _again("ask", learner, tmp_path, []) == f"bayespbrl ask {tmp_path}"
+    line = command_to_continue("resume", Settings("package:Env-v0"), tmp_path, ["Ada"])
+    assert line == f"bayespbrl resume {tmp_path} --answerer=Ada --import-package"
+    assert command_to_continue("ask", Settings("Pendulum-v1"), tmp_path) == f"bayespbrl ask {tmp_path}"
 
 
 @pytest.mark.usefixtures("unpictured")

@@ -19,6 +19,7 @@ import pytest
 from toys import INTERRUPTIBLE, QUICK, READY, Slope, fingerprint
 
 import bayespbrl
+from bayespbrl.cli.display import ask_on_page
 from bayespbrl.people.clips import MOST_BYTES
 from bayespbrl.people.page import KINDS, LARGEST_BODY, SHELL, Page
 from bayespbrl.people.session import Session
@@ -734,6 +735,31 @@ def test_ctrl_c_ends_a_sitting_with_its_status_and_the_same_command_goes_on(tmp_
     assert person.sit(None)
     assert person.acknowledged == [(0, "first"), (1, "second"), (2, "first"), (3, "second")]
     assert bayespbrl.load(tmp_path / "run").learner.finished
+
+
+def test_an_interrupt_after_the_last_answer_on_a_page_says_how_to_get_the_pictures(capsys, tmp_path):
+    learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
+    person = Person(tmp_path / "run")
+
+    def look(page):
+        def answer():
+            for view in person._views(urlsplit(page)):
+                if view["phase"] == "question":
+                    person._answer(urlsplit(page), view)
+                elif view["phase"] == "finished":
+                    break
+
+        threading.Thread(target=answer, daemon=True).start()
+
+    with (
+        mock.patch("bayespbrl.cli.display.somebody_looks", return_value=True),
+        mock.patch("bayespbrl.cli.display.open_in_browser", side_effect=look),
+        mock.patch("bayespbrl.cli.display._film", side_effect=KeyboardInterrupt),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        ask_on_page(learner, tmp_path / "run", practice=False)
+    assert learner.finished
+    assert f"Nothing is lost: bayespbrl resume {tmp_path / 'run'}" in capsys.readouterr().out.replace("\n", "")
 
 
 def test_a_server_that_is_killed_at_any_moment_loses_no_answer_and_counts_none_twice(tmp_path):

@@ -1,6 +1,5 @@
 """What the command line shows: progress, tables and pictures of runs and studies, and questions to a person."""
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from bayespbrl.envs.stepping import of_whole_episodes
 from bayespbrl.experts import Expert, TerminalExpert
 from bayespbrl.figures import new_figure, png
 from bayespbrl.learner import Learner
+from bayespbrl.runs.directory import command_to_continue
 from bayespbrl.runs.files import write_file
 from bayespbrl.runs.film import film_policy
 from bayespbrl.runs.simulated import expert_of
@@ -54,14 +54,9 @@ def run_to_the_end(
             _run_with_bar(learner, expert_of(learner))
         show_run(learner, directory)
     except KeyboardInterrupt:
-        console.print(f"\nStopped. Nothing is lost: {_again('resume', learner, directory, answerers)}")
+        again = command_to_continue("resume", learner.settings, directory, answerers)
+        console.print(f"\nStopped. Nothing is lost: {again}")
         raise
-
-
-def _again(command: str, learner: Learner, directory: Path, answerers: Sequence[str]) -> str:
-    """The command that continues a run, for the same people."""
-    options = [*(f"--answerer={name}" for name in answerers), *["--import-package"] * (":" in learner.settings.env)]
-    return shlex.join(["bayespbrl", command, str(directory), *options])
 
 
 def ask_on_page(
@@ -89,7 +84,7 @@ def ask_on_page(
     from bayespbrl.people.page import Page
     from bayespbrl.people.session import Session
 
-    again = _again("ask", learner, directory, answerers)
+    again = command_to_continue("ask", learner.settings, directory, answerers)
     session = Session(learner, most_answers=answers, answerer=answerers or None, practice=practice)
     page = Page(session, host=place.host, port=place.port)
     console.print(f"Run directory: {directory}\nOpen this page in a browser; Ctrl-C ends it:")
@@ -99,17 +94,19 @@ def ask_on_page(
         open_in_browser(page.address)
     try:
         page.serve()
+        view = page.session.view
+        if view["phase"] == "failed":
+            raise ValueError(view["say"])
+        console.print(view["say"])
+        if learner.finished:
+            show_run(learner, directory)
+        else:
+            console.print(f"This continues: {again}")
     except KeyboardInterrupt:
+        if learner.finished:  # only the pictures are missing
+            again = command_to_continue("resume", learner.settings, directory)
         console.print(f"\nStopped. Nothing is lost: {again}")
         raise
-    view = page.session.view
-    if view["phase"] == "failed":
-        raise ValueError(view["say"])
-    console.print(view["say"])
-    if learner.finished:
-        show_run(learner, directory)
-    else:
-        console.print(f"This continues: {again}")
 
 
 def check_expert(name: str | None, answerers: Sequence[str]) -> None:

@@ -8,6 +8,7 @@ summary.json          the figures of each completed iteration
 
 import json
 import os
+import shlex
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -305,6 +306,12 @@ def read_complete_summary(directory: Path | str) -> dict[str, Any]:
         figures = {name: summary.get(name) for name in ("seed", "env", "utility")}
         raise ValueError(f"{file}: expected seed, env and utility of a run, got {str(figures)[:120]}")
     return summary
+
+
+def command_to_continue(command: str, settings: Settings, path: Path, answerers: Sequence[str] = ()) -> str:
+    """`bayespbrl resume` or `ask` for a run, as a line for a shell, with the names of the people who answer."""
+    options = [*(f"--answerer={name}" for name in answerers), *["--import-package"] * (":" in settings.env)]
+    return shlex.join(["bayespbrl", command, str(path), *options])
 
 
 def _check_own(path: Path) -> None:

@@ -1,6 +1,5 @@
 """The diagnostic report of a run: read the run, assemble the report, write it as one file."""
 
-import shlex
 from collections.abc import Callable
 from datetime import datetime
 from importlib.metadata import version
@@ -21,6 +20,7 @@ from bayespbrl.diagnostics.report.people import has_people, people_section
 from bayespbrl.diagnostics.report.summary import summary
 from bayespbrl.diagnostics.report.warnings import find_warnings
 from bayespbrl.features import StateFeatures
+from bayespbrl.runs.directory import command_to_continue
 from bayespbrl.runs.files import write_file
 
 
@@ -127,14 +127,9 @@ def _state(contents: RunContents) -> str:
     text = f"In progress: {done} of at most {wanted} iterations.{question} "
     if contents.settings.own_parts:
         return text + f"Continue it in Python with bayespbrl.resume({str(contents.path)!r}) and your own objects."
-    return text + f"Continue it with: {_continuing(contents)}"
-
-
-def _continuing(contents: RunContents) -> str:
-    """The command that goes on, for the people who have answered so far."""
-    command = ["bayespbrl", "ask" if contents.settings.expert == "page" else "resume", str(contents.path)]
-    command += [f"--answerer={name}" for name in contents.preferences.answerers if name is not None]
-    return shlex.join([*command, *["--import-package"] * (":" in contents.settings.env)])
+    people = [name for name in contents.preferences.answerers if name is not None]
+    command = "ask" if contents.settings.expert == "page" else "resume"
+    return text + f"Continue it with: {command_to_continue(command, contents.settings, contents.path, people)}"
 
 
 def _facts(contents: RunContents) -> list[tuple[str, str]]:
