@@ -25,6 +25,7 @@ from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.models.threads import one_blas_thread
 from bayespbrl.policies import Policy, Sampler, greedy
+from bayespbrl.policies.policy import has_mode
 from bayespbrl.preferences import opponent_now, opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
 from bayespbrl.settings import Settings
@@ -115,10 +116,10 @@ class Cycle:
         return _entry(event, trajectories=collected)
 
     def _collected(self, state: LearnerState, policy: Policy) -> tuple[Trajectory, ...]:
-        """New trajectories; the last of an updated policy is without its noise, where that is asked for."""
+        """New trajectories, the last without the policy's noise where `_shows_kept`."""
         options, iteration = self.settings.rollouts, state.iteration
         number = options.trajectories_per_iteration
-        noisy = number - (options.noise_free and iteration > 0)
+        noisy = number - self._shows_kept(state)
         first = [len(each) for each in state.trajectories[:number]]
         hold = options.hold(first or [step_limit(self.environment, options.max_steps)])
         starts = self._starts(iteration)[:noisy] if self.settings.questions.same_start else None
@@ -127,6 +128,11 @@ class Cycle:
             return explored
         start = self.reset_seed(iteration * number + noisy)
         return explored + self._roll(greedy(policy), self._key(NOISE_FREE, iteration), 1, starts=[start])
+
+    def _shows_kept(self, state: LearnerState) -> bool:
+        """Whether the last new trajectory is without noise: where that is asked for, and an update made the policy."""
+        updated = state.iteration > state.started and not state.restarts(self.settings)
+        return self.settings.rollouts.noise_free and updated and has_mode(state.policy)
 
     def _tried(self, policy: Sampler) -> tuple[Trajectory, ...]:
         """Trajectories without the policy's noise, from starts that are the same for all policies of the run."""
@@ -146,7 +152,7 @@ class Cycle:
         if state.estimate is None or not standing:  # none: all were skipped
             return questions.first_questions(new, opponents, options, rng=rng)
         signal = None if state.bound is None else state.bound.signal
-        noise_free = new[-1] if self.settings.rollouts.noise_free else None
+        noise_free = new[-1] if self._shows_kept(state) else None
         given = QuerySituation(
             new, known, state.shown, standing[-1], state.estimate, signal, rng, opponents, standing, noise_free
         )

@@ -1,6 +1,7 @@
 """Step 4: which trajectories to ask about, and the question "this one or the best so far?" (paper, step 4).
 
 A query rule orders trajectories; the first is asked about, the next when that question is skipped or more are asked.
+Before it comes a policy without its noise that the posterior doubts (`QuerySituation.doubted`).
 Undominated trajectories in the order, as the incumbent, are left out: they are what the others are compared with.
 
 Three lines make one of your own, for `Learner(query=...)`:
@@ -27,7 +28,7 @@ QUERY_DRAWS = 500
 MOST_OLDER = 20  # their draws would soon cost more than all else
 # Answers of which all are ties: from so many on it counts as information whether the next is one too.
 ONLY_TIES = 4
-DOUBT = 0.25  # nats that an answer is expected to tell: one that the posterior foresees with less than some 0.9
+DOUBT = 0.25  # nats that an answer is expected to tell: of draws that are sure each, less than 0.93 agree
 
 
 @dataclass(frozen=True)

@@ -132,15 +132,17 @@ def later_questions(
 ) -> Chosen:
     """The questions that `rule` chooses, after `unasked` iterations in a row without any.
 
-    None where the iteration skips them, or the best is not worth asking once an answer stated an order. First comes
-    the policy without its noise where the posterior is in doubt about it; then the iteration is not skipped.
+    None where the iteration skips them, or the best is not worth asking once an answer stated an order. From then on
+    the policy without its noise comes first where the posterior is in doubt about it, alone if the iteration would
+    have been skipped.
     """
     if options.informative_ties and not preferences.pairs:
         situation = replace(situation, only_ties=preferences.answers)
     doubted = situation.doubted() if preferences.pairs and options.left(preferences.answers) > 0 else ()
-    if not doubted and options.skips(preferences, unasked, situation.estimate, situation.signal):
+    skipped = options.skips(preferences, unasked, situation.estimate, situation.signal)
+    if skipped and not doubted:
         return Chosen()
-    others = (number for number in candidates(rule, situation) if number not in doubted)
+    others = () if skipped else (number for number in candidates(rule, situation) if number not in doubted)
     order, opponents, information = (*doubted, *others), None, None
     if options.same_start:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)

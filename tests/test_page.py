@@ -3,12 +3,14 @@
 import http.client
 import json
 import os
+import queue
 import random
 import signal
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from importlib.resources import files
 from unittest import mock
@@ -739,25 +741,23 @@ def test_ctrl_c_ends_a_sitting_with_its_status_and_the_same_command_goes_on(tmp_
 
 def test_an_interrupt_after_the_last_answer_on_a_page_says_how_to_get_the_pictures(capsys, tmp_path):
     learner = bayespbrl.start("gridworld", tmp_path / "run", expert="page", **QUICK)
-    person = Person(tmp_path / "run")
-
-    def look(page):
-        def answer():
-            for view in person._views(urlsplit(page)):
-                if view["phase"] == "question":
-                    person._answer(urlsplit(page), view)
-                elif view["phase"] == "finished":
-                    break
-
-        threading.Thread(target=answer, daemon=True).start()
-
+    person, opened = Person(tmp_path / "run"), queue.SimpleQueue()
     with (
         mock.patch("bayespbrl.cli.display.somebody_looks", return_value=True),
-        mock.patch("bayespbrl.cli.display.open_in_browser", side_effect=look),
+        mock.patch("bayespbrl.cli.display.open_in_browser", side_effect=opened.put),
         mock.patch("bayespbrl.cli.display._film", side_effect=KeyboardInterrupt),
-        pytest.raises(KeyboardInterrupt),
+        ThreadPoolExecutor(1) as server,  # a thread of its own, as in `served`: a test's browser has an event loop here
     ):
-        ask_on_page(learner, tmp_path / "run", practice=False)
+        sitting = server.submit(ask_on_page, learner, tmp_path / "run", practice=False)
+        address = urlsplit(opened.get(timeout=60))
+        with closing(person._views(address)) as views:
+            for view in views:
+                if view["phase"] == "question":
+                    person._answer(address, view)
+                elif view["phase"] == "finished":
+                    break
+        with pytest.raises(KeyboardInterrupt):
+            sitting.result(timeout=60)
     assert learner.finished
     assert f"Nothing is lost: bayespbrl resume {tmp_path / 'run'}" in capsys.readouterr().out.replace("\n", "")
 

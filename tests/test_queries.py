@@ -329,32 +329,25 @@ def test_nothing_is_asked_once_the_budget_is_spent():
 
 
 @pytest.mark.parametrize(
-    ("likely", "answers", "expected"),
+    ("likely", "signal", "answers", "expected"),
     [
-        (0.5, 8, (1, (2, 0, 1))),  # in doubt: first, and the iteration asks
-        (0.95, 8, (0, ())),  # foreseen: the signal is high, so the iteration asks nothing
-        (0.5, 20, (0, ())),  # the budget is spent
+        (0.5, 0.9, 8, (1, (2,))),  # in doubt, where the iteration would ask nothing
+        (0.5, 0.1, 8, (1, (2, 0, 1))),  # in doubt: before those of the rule
+        (0.95, 0.9, 8, (0, ())),  # foreseen: the signal is high, so the iteration asks nothing
+        (0.5, 0.9, 20, (0, ())),  # the budget is spent
     ],
 )
-def test_a_policy_without_its_noise_is_asked_about_while_the_posterior_doubts_it(likely, answers, expected):
+def test_a_policy_without_its_noise_is_asked_about_while_the_posterior_doubts_it(likely, signal, answers, expected):
     """Trajectory 2 is without noise, 3 the incumbent; the rule by itself would ask about 0, 1, 2."""
     better = np.where(np.arange(100) < 100 * likely, 9.0, -9.0)
     draws = np.column_stack([np.full(100, 30.0), np.full(100, 20.0), better])
-    given = replace(situation(draws, np.zeros(100), signal=0.9), noise_free=2)
+    given = replace(situation(draws, np.zeros(100), signal=signal), noise_free=2)
     given.estimate.posterior, given.estimate.quality = "drawn", SimpleNamespace(converged=True)
-    options = Questions(unasked_iterations=4, answers=20, worthwhile=True)
-    chosen = later_questions(
-        QUERY_RULES["highest-utility"], given, options, Preferences(((0, 1),), (0,), answers), unasked=0
-    )
+    options, after = Questions(unasked_iterations=4, answers=20, worthwhile=True), Preferences(((0, 1),), (0,), answers)
+    chosen = later_questions(QUERY_RULES["highest-utility"], given, options, after, unasked=0)
     assert (chosen.wanted, chosen.candidates) == expected
-    without = later_questions(
-        QUERY_RULES["highest-utility"],
-        replace(given, noise_free=None),
-        options,
-        Preferences(((0, 1),), (0,), answers),
-        unasked=0,
-    )
-    assert without.wanted == 0
+    without = replace(given, noise_free=None)
+    assert later_questions(QUERY_RULES["highest-utility"], without, options, after, unasked=0).wanted == 0
 
 
 @pytest.mark.parametrize(("signal", "sure"), [(0.49, False), (0.51, True)])

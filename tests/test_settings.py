@@ -192,6 +192,7 @@ def test_where_states_are_discrete_goals_may_be_rare():
         20,
     )
     assert options("SomebodysEnv-v3", replace(longer, horizon=10)) == ((True, True), None, 0, 80)
+    assert not settings_for("SomebodysEnv-v3", task=table, checked=False).rollouts.noise_free  # it keeps the newest
     assert options("gridworld", table) == ((False, False), 4, 0, 10)  # as its figures were measured
 
 

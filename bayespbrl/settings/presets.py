@@ -144,6 +144,8 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
             options |= task.more_trajectories()
         if "exploration_hold" not in given:
             options |= task.longer_hold()
+    if not chosen.get("checked", True):
+        options.pop("noise_free", None)  # such a run keeps the newest policy, with its noise
     if chosen.get("diffusion_utility"):
         options.pop("standardised_utility", None)  # the other kind of features of discrete states
     if people:

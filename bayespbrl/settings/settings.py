@@ -101,7 +101,8 @@ class Rollouts:
         iteration differ; the paper's is 1. None: a fortieth of an episode, in the first iteration by the limit of
         steps, then by the mean length of the first trajectories, which may end early. Evaluations never hold it.
       noise_free: whether the last trajectory of each iteration but the first follows the policy without its noise, as
-        the run keeps it. A question is about it where the posterior is in doubt (`queries.DOUBT`), whatever the rule.
+        the run keeps it. Once an answer stated an order, a question is about it wherever the posterior is in doubt
+        (`queries.DOUBT`), whatever the rule, also in an iteration that would ask nothing.
       evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
       policy: the kind of policy. `auto` takes tabular for discrete states, softmax for discrete actions in continuous
         states, gaussian-process otherwise; `other` is a policy of the user's.
