@@ -91,8 +91,8 @@ TASKS = {
     for task, check_episodes in (("gridworld", 40), ("swing-up", 8), ("bicycle", 40), ("acrobot", 40))
 }
 # The Gridworld is without what the default has come to do where states are discrete: its figures are older.
+TASKS["gridworld"] |= dict.fromkeys(("standardised_utility", "informative_ties", "noise_free"), False)
 TASKS["gridworld"] |= {"critic_iterations": 4}
-TASKS["gridworld"] |= {"standardised_utility": False, "informative_ties": False, "noise_free": False}
 # An environment object of the user's is known by its gymnasium id.
 IDS = {identity: short for short, identity in SHORT_NAMES.items()}
 DEFAULT: dict[str, Any] = {

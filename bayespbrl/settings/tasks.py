@@ -60,10 +60,9 @@ class Task:
         """
         continuous = isinstance(self.action_space, Box)
         dimensions = self.observation_space.shape[0] if isinstance(self.observation_space, Box) else 0
-        of_a_table = {"restart_iterations": 0, "critic_iterations": None}
+        of_a_table = {"restart_iterations": 0, "critic_iterations": None, "noise_free": True}
         of_rare_goals = {"standardised_utility": True, "informative_ties": True}
-        where_one_stays = {"noise_free": True}
-        return ({} if dimensions else of_a_table | of_rare_goals | where_one_stays) | {
+        return ({} if dimensions else of_a_table | of_rare_goals) | {
             "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
             "exploration_hold": None if continuous else 1,
             "trajectories_per_iteration": TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS,
