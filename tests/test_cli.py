@@ -18,7 +18,7 @@ import xarray as xr
 
 import bayespbrl
 from bayespbrl.cli.commands import main
-from bayespbrl.cli.compiled import VARIABLE, keep_compiled
+from bayespbrl.cli.compiled import LEAST_SECONDS, VARIABLE, keep_compiled
 from bayespbrl.cli.display import show_trials
 from bayespbrl.runs.directory import command_to_continue
 from bayespbrl.settings import Settings
@@ -281,7 +281,8 @@ def test_the_module_runs_as_a_program():
 
 
 def test_what_is_compiled_is_kept_in_the_users_cache_unless_jax_is_told_where(monkeypatch, tmp_path):
-    kept = jax.config.jax_compilation_cache_dir
+    kept, seconds = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
+    monkeypatch.delenv(LEAST_SECONDS, raising=False)
     try:
         monkeypatch.setenv(VARIABLE, "elsewhere")
         keep_compiled()
@@ -295,6 +296,9 @@ def test_what_is_compiled_is_kept_in_the_users_cache_unless_jax_is_told_where(mo
         keep_compiled()
         (folder,) = (tmp_path / "bayespbrl").iterdir()
         assert os.environ[VARIABLE] == jax.config.jax_compilation_cache_dir == str(folder)
+        assert (os.environ[LEAST_SECONDS], jax.config.jax_persistent_cache_min_compile_time_secs) == ("0", 0.0)
     finally:
-        os.environ.pop(VARIABLE, None)  # before monkeypatch restores it
+        for name in (VARIABLE, LEAST_SECONDS):
+            os.environ.pop(name, None)  # before monkeypatch restores it
         jax.config.update("jax_compilation_cache_dir", kept)
+        jax.config.update(LEAST_SECONDS.lower(), seconds)

@@ -11,6 +11,8 @@ import jax
 from bayespbrl.studies.machine import processor_lines
 
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"  # JAX's own; it holds where it is set
+# The least seconds of compilation for which JAX keeps a function. A run compiles some twenty in less than the default.
+LEAST_SECONDS = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 HARMLESS = tuple(f"Error {doing} persistent compilation cache entry" for doing in ("reading", "writing"))
 
 
@@ -32,6 +34,9 @@ def keep_compiled() -> None:
         return
     os.environ[VARIABLE] = str(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
+    if LEAST_SECONDS not in os.environ:
+        os.environ[LEAST_SECONDS] = "0"
+        jax.config.update(LEAST_SECONDS.lower(), 0.0)
 
 
 def _processor() -> str:
