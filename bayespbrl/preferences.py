@@ -156,8 +156,9 @@ class Preferences:
         In a tie (`preferred=None`) the newcomer joins them, and the pair is a tie. So ties count as equal, and after
         some of them one answer states several pairs, of which only one was shown.
 
-        Where several people answer at once, or several questions of an iteration have one opponent, an incumbent may
-        have become dominated. Then the answer is about the two alone, and only a better newcomer becomes undominated.
+        Where several people answer at once, or an iteration has several questions, either may have been compared
+        meanwhile. Where one has become dominated, the answer is about the two alone: it does not become undominated
+        again, nor by a tie with it the other one.
 
         Args:
           rivals: the undominated trajectories that the newcomer is compared with, the incumbent among them unless it
@@ -176,22 +177,25 @@ class Preferences:
         if preferred not in (None, newcomer, incumbent):
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
         beside = self.undominated if rivals is None else tuple(each for each in rivals if each in self.undominated)
-        fallen = rivals is not None and self.has_fallen(incumbent)
-        if fallen:
+        beside = tuple(each for each in beside if each != newcomer)
+        beaten = [each for each in (newcomer, incumbent) if rivals is not None and self.has_fallen(each)]
+        if beaten:
             beside = (incumbent,)
         elif incumbent not in beside:
             beside = (*beside, incumbent)
-        others = tuple(each for each in self.undominated if each not in beside)
+        others = tuple(each for each in self.undominated if each not in (*beside, newcomer))
         asked = (incumbent, newcomer) if preferred == incumbent else (newcomer, incumbent)
         new_pairs, ties, standing = tuple[tuple[int, int], ...](), self.ties, (*others, *beside)
-        if fallen:
-            standing = self.undominated
+        if beaten:
+            standing = tuple(each for each in self.undominated if each != newcomer or preferred is None)
         if preferred is None:
-            ties, standing = (*ties, asked), standing if fallen else (*standing, newcomer)
+            ties, standing = (*ties, asked), standing if beaten else (*standing, newcomer)
         elif preferred == newcomer:
-            new_pairs, standing = tuple((newcomer, member) for member in beside), (*others, newcomer)
+            new_pairs = tuple((newcomer, member) for member in beside)
+            standing = others if newcomer in beaten else (*others, newcomer)
         else:
             new_pairs = tuple((member, newcomer) for member in beside)
+        standing = standing or self.undominated  # answers in a circle leave none
         after = Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, self.sources)
         return after._with_sources(self, asked, shown_first, answerer)
 

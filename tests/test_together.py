@@ -417,6 +417,29 @@ def test_an_answer_about_an_incumbent_that_has_fallen_is_about_the_two_alone():
     assert (tie.ties, tie.undominated) == (((2, 0),), (1,))
 
 
+def test_an_answer_about_a_newcomer_that_has_fallen_does_not_raise_it_again():
+    before = Preferences(undominated=(3,)).add(4, 0, preferred=4, rivals=[])  # 0 was the opponent of 4
+    better = before.add(0, 1, preferred=0, rivals=[])
+    assert (better.pairs, better.undominated) == (((4, 0), (0, 1)), (3, 4))
+    assert before.add(0, 1, preferred=1, rivals=[]).undominated == (3, 4)
+    tie = before.add(0, 1, preferred=None, rivals=[])
+    assert (tie.ties, tie.undominated) == (((0, 1),), (3, 4))
+    assert before.add(0, 4, preferred=0, rivals=[4]).undominated == (3,)  # contradicted: neither is undominated
+
+
+def test_a_newcomer_that_has_become_undominated_meanwhile_is_there_once():
+    before = Preferences(undominated=(3,)).add(4, 0, preferred=0, rivals=[])
+    assert before.add(0, 1, preferred=0, rivals=[]).undominated == (3, 0)
+    assert before.add(0, 1, preferred=1, rivals=[]).undominated == (3, 1)
+    assert before.add(0, 1, preferred=None, rivals=[]).undominated == (3, 1, 0)
+    assert before.add(0, 3, preferred=0, rivals=[3, 0]).pairs == ((0, 4), (0, 3))
+    # answers in a circle: somebody has to be compared with
+    circle = (
+        Preferences(undominated=(0,)).add(1, 0, preferred=1).add(2, 1, preferred=2).add(0, 2, preferred=0, rivals=[2])
+    )
+    assert circle.undominated == (2,)
+
+
 def test_only_those_that_ties_connect_compete_with_a_newcomer():
     standing = Preferences(undominated=(0, 1, 2, 3), ties=((1, 0), (3, 1), (5, 2)))
     assert standing.tied_with(3) == (0, 1, 3)

@@ -126,7 +126,7 @@ class Chains:
     def with_references(self, fits: Sequence[GaussianFit], values: Mapping[str, float]) -> "Chains":
         """The same chains with the references of other fits, which were made at these values of the unknowns."""
         rank = max(fit.factors.loadings.shape[1] for fit in fits)
-        power = self._power(fits) if self.many else REFERENCE_POWER
+        power = self._power(fits) if self.many and has_steps(fits[0].likelihood) else REFERENCE_POWER
         settings = stacked([_with_reference(fit, rank, power) for fit in fits])
         fitted = None if self.problem.fitted_steepness is None else values["steepness"]
         return replace(self, problem=self.problem._replace(settings=settings, fitted_steepness=fitted))

@@ -91,7 +91,7 @@ def _at_once(draws: Float[np.ndarray, "chain draw q"]) -> tuple[Float[np.ndarray
     split = np.concatenate([draws[:, :half], draws[:, -half:]])
     normal = _rank_normalised(split)
     folded = _rank_normalised(np.abs(split - np.median(split, axis=(0, 1))))
-    rhat = np.maximum(_split_rhat(normal), _split_rhat(folded))
+    rhat = np.fmax(_split_rhat(normal), _split_rhat(folded))  # folded draws of two values may all be equal
     error = np.std(draws, axis=(0, 1), ddof=1) / np.sqrt(_effective_sample_size(split))
     finite = np.all(np.isfinite(draws), axis=(0, 1))
     return tuple(np.where(finite, each, np.nan) for each in (rhat, _effective_sample_size(normal), error))
