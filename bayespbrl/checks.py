@@ -1,7 +1,9 @@
 """Checks of arguments, one for each kind: a `ValueError` says which argument it is, what was expected and what came."""
 
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,6 +23,13 @@ def whole(name: str, value: Any, least: int = 1, *, most: int | None = None) -> 
 def seed(value: Any) -> int:
     """A seed as an int, where it is a whole number that a run can keep."""
     return whole("seed", value, 0, most=MOST_SEED)
+
+
+def path(name: str, value: Any) -> Path:
+    """`value` as a path, where it is one or a string."""
+    if not isinstance(value, str | os.PathLike):
+        raise ValueError(f"{name}: expected a path, got {shortened(value)}")
+    return Path(value)
 
 
 def boolean(name: str, value: Any) -> bool:
@@ -85,7 +94,8 @@ def function_or_name(option: str, given: Choice | str | None, name: str, known: 
     if given is not None and not isinstance(given, str):
         return given
     if name not in known:
-        raise ValueError(f"{option}: expected a function, because the settings say {name!r}, got none")
+        came = "none" if given is None else repr(given)
+        raise ValueError(f"{option}: expected a function, because the settings say {name!r}, got {came}")
     return known[name]
 
 

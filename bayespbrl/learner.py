@@ -231,7 +231,9 @@ class Learner:
     ) -> None:
         if isinstance(answers, str) or not isinstance(answers, Sequence) or len(answers) != len(waiting):
             by = "ask()" if answerer is None else f"ask(answerer={answerer!r})"
-            raise ValueError(f"tell: expected a list of {len(waiting)} answers, one to each of {by}, got {answers!r}")
+            none = "" if waiting else " (no question waits)"
+            expected = f"a list of {len(waiting)} answers, one to each of {by}{none}"
+            raise ValueError(f"tell: expected {expected}, got {answers!r}")
         parsed = [parse_answer(answer) for answer in answers]
         if Answer.UNDO in parsed and len(parsed) > 1:
             raise ValueError(

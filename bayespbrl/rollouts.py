@@ -69,7 +69,7 @@ def rollout(
       policy: its `sample` is JAX-traceable if the policy is a pytree of arrays.
       key: JAX random key; it decides everything, resets included.
       episodes: number of episodes, ≥ 1.
-      max_steps: time limit; by default the environment's own.
+      max_steps: time limit; by default the environment's own, which an object of yours keeps where it is less.
       hold: steps for which the policy's random key stays the same, ≥ 1; where dynamics are compiled, the first block of
         an episode is shorter, at random. Each action still follows the policy at its state. Noise that neighbouring
         steps share leads further away than noise that averages out.

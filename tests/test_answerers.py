@@ -268,7 +268,7 @@ def test_an_answer_to_a_question_that_waits_for_another_person_is_refused():
     while run.ask()[0].repeats is None:
         run.tell(["first"], answerer="Ada")
     with pytest.raises(
-        ValueError, match=r"tell: expected a list of 0 answers, one to each of ask\(answerer='Ben'\), got"
+        ValueError, match=r"tell: expected a list of 0 answers, one to each of ask\(answerer='Ben'\) \(no"
     ):
         run.tell(["first"], answerer="Ben")
     (query,) = run.ask(answerer="Ben")
@@ -526,6 +526,12 @@ def test_answers_collected_elsewhere_by_hand(tmp_path):
     (tmp_path / "plain.csv").write_text("answer,second,first\nsecond,0,1\nskip,2,1\n")
     assert read_answers(tmp_path / "plain.csv")[:2] == (((0, 1),), ())
     assert read_answers(tmp_path / "plain.csv").answerers is None
+
+
+def test_a_column_in_capitals_is_not_left_out_without_a_word(tmp_path):
+    (tmp_path / "answers.csv").write_text("first,second,answer,Answerer,Age\n0,1,first,Ada,30\n")
+    with pytest.raises(ValueError, match=r"answers\.csv: expected the column answerer in small letters, got Answerer"):
+        read_answers(tmp_path / "answers.csv")
 
 
 @pytest.mark.parametrize("mark", ["", "\ufeff"], ids=["plain", "byte-order mark"])

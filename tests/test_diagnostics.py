@@ -5,6 +5,7 @@ import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+import bayespbrl
 from bayespbrl import diagnostics
 from bayespbrl.diagnostics import convergence, plot_convergence, plot_ranks
 from bayespbrl.diagnostics.plots import trials_figure
@@ -22,6 +23,17 @@ def draws():
     margins[1, :, 1] += 6.0
     margins[:, :, 2] = 0.0
     return margins
+
+
+def test_what_is_no_posterior_is_refused_with_a_word_where_one_is():
+    inferred = bayespbrl.infer_utility(np.eye(3), [(0, 1)], steepness=5.0, lapse_rate=0.0)
+    for diagnose in (convergence, diagnostics.influence, diagnostics.sensitivity, diagnostics.predictive_checks):
+        with pytest.raises(
+            ValueError, match=r"tree: expected a posterior, .*, got PosteriorUtility; its .posterior is"
+        ):
+            diagnose(inferred)
+        with pytest.raises(ValueError, match=r"tree: expected a posterior, as sample_posterior returns it, got NoneT"):
+            diagnose(None)
 
 
 def test_every_exported_name_is_there():

@@ -289,8 +289,30 @@ def test_a_step_of_the_old_interface_is_refused_instead_of_its_info_being_taken_
             return np.zeros(2, np.float32), 1.0, False, {"distance": 0.3}
 
     policy = SoftmaxPolicy.initial(Old.observation_space, Old.action_space)
-    with pytest.raises(ValueError, match=r"environment Old failed at step 1: .*expected 5, got 4"):
+    with pytest.raises(
+        ValueError, match=r"Old failed at step 1: .*expected \(observation, reward, terminated, .*, got \(array"
+    ):
         rollout(Old(), policy, key=jax.random.key(0), episodes=2, max_steps=5)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (np.zeros(2, np.float32), r"expected \(observation, info\), got array"),
+        ((np.zeros(3, np.float32), {}), r"expected an observation of shape \(2,\), got array\(\[0., 0., 0.\]"),
+    ],
+    ids=["the observation alone", "a number more"],
+)
+def test_a_reset_that_returns_something_else_is_told_what_was_expected(returned, message):
+    class Odd(gymnasium.Env):
+        observation_space, action_space = Box(-1.0, 1.0, (2,)), Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            return returned
+
+    policy = SoftmaxPolicy.initial(Odd.observation_space, Odd.action_space)
+    with pytest.raises(ValueError, match=f"environment Odd failed at its reset: ValueError: {message}"):
+        rollout(Odd(), policy, key=jax.random.key(0), episodes=2, max_steps=5)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

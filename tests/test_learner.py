@@ -308,7 +308,9 @@ def test_what_is_no_answer_is_refused_and_nothing_has_happened(answers):
         run.tell(answers)
     assert run.state is state
     assert len(log.entries) == length
-    with pytest.raises(ValueError, match="tell: expected a list of 0 answers"):
+    with pytest.raises(
+        ValueError, match=r"tell: expected a list of 0 answers, one to each of ask\(\) \(no question waits\)"
+    ):
         learner().tell(["first"])  # nothing has been asked yet
 
 

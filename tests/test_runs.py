@@ -26,11 +26,13 @@ from bayespbrl.diagnostics.report import tables as report_tables
 from bayespbrl.diagnostics.report import write_report
 from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.envs.opening import given_by_name, open_environment
+from bayespbrl.envs.spaces import in_words
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.features import OneHot, drawn
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.runs import directory as run_directory
 from bayespbrl.runs import run as runs
+from bayespbrl.runs.answers_file import read_answers
 from bayespbrl.runs.directory import PartialLine, RunDirectory, read_log_lines
 from bayespbrl.runs.stored_classes import classes_of, from_tree, to_tree
 from bayespbrl.settings.presets import PAPER
@@ -641,17 +643,17 @@ def test_a_run_to_which_another_learner_writes_while_it_is_read_is_not_resumed(t
 def test_runs_that_begin_in_one_second_have_directories_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = start(tmp_path / "run").settings
-    made = [RunDirectory.create_fresh(settings).path for _ in range(4)]
+    made = [RunDirectory.create_fresh(settings, {}).path for _ in range(4)]
     assert len(set(made)) == 4
     taken, create = [], RunDirectory.create.__func__
 
-    def overtaken(cls, path, settings):  # by another process, after the name was chosen
+    def overtaken(cls, *arguments):  # by another process, after the name was chosen
         if not taken:
-            taken.append(create(cls, path, settings))
-        return create(cls, path, settings)
+            taken.append(create(cls, *arguments))
+        return create(cls, *arguments)
 
     monkeypatch.setattr(RunDirectory, "create", classmethod(overtaken))
-    other = RunDirectory.create_fresh(settings).path
+    other = RunDirectory.create_fresh(settings, {}).path
     assert other != taken[0].path
     assert (other.parent, other.exists(), taken[0].path.exists()) == (tmp_path / "runs", True, True)
 
@@ -772,6 +774,53 @@ def test_an_environment_with_more_states_than_the_policy_has_is_refused(tmp_path
     with pytest.raises(ValueError, match=r"run: policy: expected one from Discrete\(9\) to "):
         runs.resume(tmp_path / "run", env=Longer())
     assert contents(tmp_path / "run") == before
+
+
+class Counted(Corridor):
+    """The corridor, whose positions and actions count from elsewhere."""
+
+    observation_space = gymnasium.spaces.Discrete(7, start=1)
+
+
+def test_an_environment_with_other_spaces_is_refused_and_a_run_that_does_not_know_its_spaces_is_not(tmp_path):
+    bayespbrl.start(Corridor(), tmp_path / "run", **IN_THE_CORRIDOR)
+    before = contents(tmp_path / "run")
+    message = r"run: env: expected the run's observation_space, Discrete\(7\), got Discrete\(7, start=1\)"
+    for read in (bayespbrl.load, runs.resume):
+        with pytest.raises(ValueError, match=message):
+            read(tmp_path / "run", env=Counted())
+    assert contents(tmp_path / "run") == before
+    file = tmp_path / "run" / "settings.json"
+    file.write_text(
+        json.dumps({name: value for name, value in json.loads(file.read_text()).items() if name != "spaces"})
+    )
+    bayespbrl.load(tmp_path / "run", env=Counted())
+
+
+def test_spaces_in_words_differ_where_their_bounds_do():
+    box, other = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Box(np.float32([-1, -2]), np.float32([1, 1]))
+    assert in_words(box) == "Box(-1.0, 1.0, (2,))"
+    assert in_words(other) == "Box([-1.0, -2.0], 1.0, (2,))"
+    both = gymnasium.spaces.Dict(a=box, b=gymnasium.spaces.Tuple([gymnasium.spaces.Discrete(3), other]))
+    assert in_words(both) == "Dict(a: Box(-1.0, 1.0, (2,)), b: Tuple(Discrete(3), Box([-1.0, -2.0], 1.0, (2,))))"
+
+
+def test_features_of_another_number_are_refused(tmp_path):
+    learner = start(tmp_path / "run", features=rows)
+    learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    assert learner.estimate is not None
+    with pytest.raises(ValueError, match=r"run: features: expected \d+ for each state, as before, got"):
+        bayespbrl.load(tmp_path / "run", features=lambda states: rows(states)[:, :-1])
+
+
+@pytest.mark.parametrize("path", [None, 3])
+def test_what_is_no_path_is_refused(path):
+    for use in (bayespbrl.load, runs.resume, read_answers):
+        with pytest.raises(ValueError, match=f"expected a path, got {path}"):
+            use(path)
+    with pytest.raises(ValueError, match="directory: expected a path, got 3"):
+        start(3)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.models.convergence import RHAT_LIMIT, SIZE_LIMIT, chain_convergence
+from bayespbrl.models.posterior_tree import check_posterior
 
 
 def convergence(
@@ -25,6 +26,7 @@ def convergence(
 
     Source: Vehtari et al. (2021).
     """
+    check_posterior(tree)
     margins = np.asarray(tree["posterior"]["margins"])
     report = chain_convergence(margins)
     tail = np.full(margins.shape[2], float(margins.shape[0] * margins.shape[1]))

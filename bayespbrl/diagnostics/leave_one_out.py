@@ -19,7 +19,7 @@ from bayespbrl.diagnostics.predictions import (
     refit,
     tied_rows,
 )
-from bayespbrl.models.posterior_tree import answers_of, bases_of, settings_of
+from bayespbrl.models.posterior_tree import answers_of, bases_of, check_posterior, settings_of
 
 PARETO_K_LIMIT = 0.7  # Vehtari et al. (2024)
 
@@ -43,6 +43,7 @@ def influence(
       row given the others, and `margin_means` (preference, margin), the means of all margins
       without the answer; `converged`, whether the refit converged. Also `margin_mean` (margin), given all answers.
     """
+    check_posterior(tree)
     number = tree["constant_data"].sizes["preference"]
     refits = None if refits is None else checks.whole("refits", refits, 0)
     differences, answers = np.asarray(tree["constant_data"]["differences"]), answers_of(tree)

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.models.low_rank import low_rank
-from bayespbrl.models.posterior_tree import bases_of
+from bayespbrl.models.posterior_tree import bases_of, check_posterior
 
 COMPONENTS = ("prior", "likelihood")
 # Least standard deviation of a log density over the draws, in nats. Below it powers near 1 have no visible effect, and
@@ -40,6 +40,7 @@ def sensitivity(tree: xr.DataTree, features: np.ndarray | None = None, *, seed: 
 
     Source: Kallioinen et al. (2024), by `arviz_stats.psense`.
     """
+    check_posterior(tree)
     draws, log_prior = _quantities(tree, features, seed=seed)
     labels = {"chain": np.arange(draws.shape[0]), "draw": np.arange(draws.shape[1])}
     varies = ~np.all(draws == draws[:1, :1], axis=(0, 1))

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from bayespbrl import checks
 from bayespbrl.diagnostics.predictions import tied_rows
 from bayespbrl.models.likelihoods import likelihood_of, prob
-from bayespbrl.models.posterior_tree import answers_of, number_of_preferences, settings_of
+from bayespbrl.models.posterior_tree import answers_of, check_posterior, number_of_preferences, settings_of
 from bayespbrl.utility.posterior_utility import spacing
 
 CHECKS = ("surprises", "cycles", "ties")
@@ -40,6 +40,7 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
     Raises:
       ValueError: fewer than one draw.
     """
+    check_posterior(tree)
     drawn = tree.children["posterior"].dataset
     number = tree.children["constant_data"].sizes["preference"]
     every = slice(None, None, spacing(drawn["setting"].size, checks.whole("draws", draws)))

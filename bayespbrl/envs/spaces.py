@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from gymnasium import Env
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple, flatten, flatten_space
 from gymnasium.vector.utils import batch_space, iterate
 
@@ -36,6 +37,25 @@ def bounded(space: Box | Discrete) -> Box | Discrete:
         return space
     low, high = np.where(none, np.copysign(np.inf, bounds), bounds)
     return Box(low, high, dtype=space.dtype.type)
+
+
+def spaces_of(env: Env) -> dict[str, str]:
+    """The observation and the action space of an environment in words, by name."""
+    return {name: in_words(getattr(env, name)) for name in ("observation_space", "action_space")}
+
+
+def in_words(space: Space[Any]) -> str:
+    """A space in words that differ where the bounds, numbers, shapes or names differ."""
+    if isinstance(space, Box):
+        low, high = (
+            each.flat[0].item() if np.unique(each).size == 1 else each.tolist() for each in (space.low, space.high)
+        )
+        return f"Box({low}, {high}, {space.shape})"
+    if isinstance(space, Dict):
+        return f"Dict({', '.join(f'{name}: {in_words(part)}' for name, part in space.spaces.items())})"
+    if isinstance(space, Tuple):
+        return f"Tuple({', '.join(map(in_words, space.spaces))})"
+    return str(space)
 
 
 def check_of_space(name: str, values: np.ndarray, space: Space[Any]) -> None:

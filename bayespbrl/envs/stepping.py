@@ -13,7 +13,7 @@ from gymnasium.wrappers import TimeLimit
 from jaxtyping import Bool, Float, Shaped
 from numpy.typing import ArrayLike
 
-from bayespbrl.checks import whole
+from bayespbrl.checks import shortened, whole
 from bayespbrl.envs.functional import FunctionalEnv
 from bayespbrl.envs.opening import (
     AnyEnvironment,
@@ -133,14 +133,26 @@ class _Silent(gymnasium.Wrapper):
 
     def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
         """The observation alone."""
-        return self.env.reset(**arguments)[0], {}
+        returned = self.env.reset(**arguments)
+        if not isinstance(returned, tuple) or len(returned) != 2:
+            raise ValueError(f"expected (observation, info), got {shortened(returned)}")
+        return self._observed(returned[0]), {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """A step without its info; NumPy would make NaN of a reward that is None."""
-        observation, reward, terminated, truncated, _ = self.env.step(action)
+        returned = self.env.step(action)
+        if not isinstance(returned, tuple) or len(returned) != 5:
+            raise ValueError(f"expected (observation, reward, terminated, truncated, info), got {shortened(returned)}")
+        observation, reward, terminated, truncated, _ = returned
         if reward is None or np.asarray(reward).ndim:
             raise ValueError(f"expected a number as the reward, got {reward!r}")
-        return observation, reward, terminated, truncated, {}
+        return self._observed(observation), reward, terminated, truncated, {}
+
+    def _observed(self, observation: Any) -> Any:
+        if np.shape(observation) != self.observation_space.shape:
+            shape = self.observation_space.shape
+            raise ValueError(f"expected an observation of shape {shape}, got {shortened(observation)}")
+        return observation
 
 
 class _Borrowed(_Silent):

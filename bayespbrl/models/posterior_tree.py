@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -42,6 +43,13 @@ def settings_of(differences: ArrayLike) -> Float[np.ndarray, "s k d"]:
             f"{largest:g}; divide them by their root mean square length"
         )
     return array
+
+
+def check_posterior(tree: Any) -> None:
+    """`ValueError` where `tree` is no posterior as `sample_posterior` returns it."""
+    if not isinstance(tree, xr.DataTree) or "posterior" not in tree.children:
+        has = "; its .posterior is one" if isinstance(getattr(tree, "posterior", None), xr.DataTree) else ""
+        raise ValueError(f"tree: expected a posterior, as sample_posterior returns it, got {type(tree).__name__}{has}")
 
 
 def margins_of(fits: Sequence[GaussianFit], chains: Chains, length: int) -> Float[np.ndarray, "chain {length} k"]:

@@ -48,7 +48,7 @@ def write_answers(file: Path | str, past: Sequence[PastQuestion]) -> Path:
         known = (getattr(each, name) for name in COLUMNS[4:])
         values = ("" if value is None else value for value in known)
         writer.writerow([each.number, each.first, each.second, str(each.answer), *values])
-    file = Path(file)
+    file = checks.path("file", file)
     try:
         write_file(file, table.getvalue())
     except OSError as error:
@@ -61,13 +61,14 @@ def read_answers(file: Path | str) -> CollectedAnswers:
 
     Args:
       file: with a head and at least the columns `first`, `second` (whole numbers from 0, in the order shown) and
-        `answer`; `answerer` is read where it is there. Rows with the answer skip are left out. A byte-order mark, as
-        Excel writes it, and spaces around a cell do no harm.
+        `answer`; `answerer` is read where it is there, and other columns are not. Rows with the answer skip are left
+        out. A byte-order mark, as Excel writes it, and spaces around a cell do no harm.
 
     Raises:
-      ValueError: a file that cannot be read, a missing column, or a bad cell, by its line and column.
+      ValueError: a file that cannot be read, a missing column or one in capitals, or a bad cell, by its line and
+        column.
     """
-    file = Path(file)
+    file = checks.path("file", file)
     try:
         lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig"), newline=""))
         lines.fieldnames = [name.strip() for name in lines.fieldnames or ()]
@@ -76,6 +77,9 @@ def read_answers(file: Path | str) -> CollectedAnswers:
                 f"expected the columns {', '.join(NEEDED)}, each once and separated by commas, got "
                 f"{', '.join(lines.fieldnames) or 'none'}"
             )
+        for name in lines.fieldnames:
+            if name not in COLUMNS and name.lower() in COLUMNS:
+                raise ValueError(f"expected the column {name.lower()} in small letters, got {name}")
         rows = [_row(line, lines.line_num) for line in lines]
     except (OSError, ValueError, csv.Error) as error:
         raise ValueError(f"{file}: {error}") from error

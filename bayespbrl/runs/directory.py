@@ -11,12 +11,13 @@ import os
 import shlex
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from bayespbrl import checks
 from bayespbrl.events import Entry, LearnerState, has_figures, surviving
 from bayespbrl.features import StateFeatures
 from bayespbrl.runs.files import check_file, synchronise, write_file
@@ -27,30 +28,36 @@ FORMAT = 3  # format 2 had one setting's posterior beside an average; format 1 n
 HEAVY = ("collected", "improved")  # events with heavy parts, in the file of their iteration
 BASELINE_FILE, FIRST_POLICY_FILE = "baseline.json", "first-policy.json"  # of a study's trials that do not learn so
 Event = dict[str, Any]
+Spaces = Mapping[str, str]  # the environment's, by name, in words
 
 
 class RunDirectory:
     """A run directory, which is the learner's `Log`; `create` makes a new one, `open` finds an existing one."""
 
-    def __init__(self, path: Path, settings: Settings):
+    def __init__(self, path: Path, settings: Settings, spaces: Spaces):
         self.path = path.absolute()  # a notebook may change its directory
-        self.settings = settings
+        self.settings, self.spaces = settings, spaces
         self._read = 0  # size of the log, in bytes, as far as `entries` has read it
         self._end: int | None = None  # and after this learner's last event
 
     @classmethod
-    def create(cls, path: Path | str, settings: Settings) -> "RunDirectory":
+    def create(cls, path: Path | str, settings: Settings, spaces: Spaces) -> "RunDirectory":
         """A new run directory. It appears together with its settings, or not at all.
+
+        Args:
+          path: must not exist.
+          settings, spaces: of the run.
 
         Raises:
           ValueError: the path exists, or cannot be written, or is no UTF-8, which netCDF could not read.
         """
-        path = Path(path)
+        path = checks.path("directory", path)
         try:
             bytes(path.absolute()).decode()
         except UnicodeDecodeError as error:
             raise ValueError(f"{str(path)!a}: expected a path in UTF-8, got another") from error
         content = {"format": FORMAT, "version": version("bayespbrl"), "env": settings.env, **settings.options()}
+        content["spaces"] = dict(spaces)
         try:
             if path.exists() or path.is_symlink():
                 raise ValueError(f"{path}: expected a run directory that does not exist yet, got one that exists")
@@ -67,18 +74,18 @@ class RunDirectory:
                 raise
         except OSError as error:
             raise ValueError(f"{path}: expected a place where a run directory can be made, got {error}") from error
-        made = cls(path, settings)
+        made = cls(path, settings, spaces)
         made._end = 0
         return made
 
     @classmethod
-    def create_fresh(cls, settings: Settings) -> "RunDirectory":
+    def create_fresh(cls, settings: Settings, spaces: Spaces) -> "RunDirectory":
         """A new run directory under `runs/`, named after the environment and the time; errors as of `create`."""
         stem = f"{settings.env.replace('/', '-').lower()}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
         path, number = Path("runs") / stem, 1
         while True:
             try:
-                return cls.create(path, settings)
+                return cls.create(path, settings, spaces)
             except ValueError:
                 if not path.exists():  # else another run has it, which may have begun in the same second
                     raise
@@ -88,7 +95,7 @@ class RunDirectory:
     @classmethod
     def open(cls, path: Path | str) -> "RunDirectory":
         """The run directory at `path`; `ValueError` where that is no run, or one of another format."""
-        path = Path(path)
+        path = checks.path("directory", path)
         file = path / "settings.json"
         content = _read_json(file, f"{path}: expected a run directory with its settings.json")
         if not isinstance(content, dict) or not isinstance(content.get("format"), int):
@@ -103,9 +110,10 @@ class RunDirectory:
         if not isinstance(content.get("env"), str):
             raise ValueError(f"{file}: expected the environment's name as env, got {content.get('env')!r}")
         _check_own(path)
-        known = {name: value for name, value in content.items() if name in OPTIONS}
+        known, spaces = {name: value for name, value in content.items() if name in OPTIONS}, content.get("spaces")
         try:
-            return cls(path, Settings.from_options(content["env"], known))
+            settings = Settings.from_options(content["env"], known)
+            return cls(path, settings, spaces if isinstance(spaces, dict) else {})  # older runs have none
         except (TypeError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
 

@@ -1,6 +1,7 @@
 """A run on disk: start it, resume it, load it."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import xarray as xr
 
 from bayespbrl import checks, rollouts
 from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, made_again
-from bayespbrl.envs.spaces import check_of_space
+from bayespbrl.envs.spaces import check_of_space, spaces_of
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
@@ -48,8 +49,8 @@ def start(
     if learner.own_policy is not None:  # better now than after the first answers
         from_tree(to_tree(learner.own_policy), known=classes_of(learner.own_policy))
     settings = learner.settings
-    made = RunDirectory.create_fresh(settings) if directory is None else RunDirectory.create(directory, settings)
-    return learner.logged(made)
+    place = RunDirectory.create_fresh if directory is None else partial(RunDirectory.create, directory)
+    return learner.logged(place(settings, spaces_of(learner.given)))
 
 
 def resume(
@@ -147,6 +148,11 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
             check_of_space("actions of the run", trajectory.actions, learner.environment.action_space)
         if env is not None:  # of more states or actions than the run's, which those of the trajectories are among
             fitting(learner.last_policy, learner.environment.observation_space, learner.environment.action_space)
+        for name, space in spaces_of(learner.given).items():
+            if log.spaces.get(name, space) != space:
+                raise ValueError(f"env: expected the run's {name}, {log.spaces[name]}, got {space}")
+        if own["features"] is not None and learner.estimate is not None and learner.trajectories:
+            learner.estimate.utilities(learner.trajectories[0].states[:1])  # as many features as before
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
     return learner

@@ -96,7 +96,7 @@ class Rollouts:
 
     Attributes:
       trajectories_per_iteration: N.
-      max_steps: steps an episode; None for the environment's own limit.
+      max_steps: steps an episode; None for the environment's own limit. An object of yours keeps its own where less.
       exploration_hold: steps for which the exploring policy's random choice is held, so that the trajectories of an
         iteration differ; the paper's is 1. None: a fortieth of an episode, in the first iteration by the limit of
         steps, then by the mean length of the first trajectories, which may end early. Evaluations never hold it.
