@@ -3,7 +3,7 @@
 from bayespbrl.experts import NoisyExpert, ReturnExpert, TerminalExpert
 from bayespbrl.learner import Learner
 from bayespbrl.preferences import Answer, Preferences, Query
-from bayespbrl.runs.answers_file import read_answers
+from bayespbrl.runs.answers_file import read_answers, read_questions
 from bayespbrl.runs.run import Run, load, resume, start
 from bayespbrl.runs.utility_reward import UtilityReward
 from bayespbrl.settings import Settings
@@ -25,6 +25,7 @@ __all__ = [
     "infer_utility",
     "load",
     "read_answers",
+    "read_questions",
     "resume",
     "start",
 ]

@@ -1,6 +1,7 @@
 """Answers of people: who gave each, how long it took, and what is kept of it."""
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from bayespbrl import (
     infer_utility,
     load,
     read_answers,
+    read_questions,
     resume,
     start,
 )
@@ -526,6 +528,39 @@ def test_answers_collected_elsewhere_by_hand(tmp_path):
     (tmp_path / "plain.csv").write_text("answer,second,first\nsecond,0,1\nskip,2,1\n")
     assert read_answers(tmp_path / "plain.csv")[:2] == (((0, 1),), ())
     assert read_answers(tmp_path / "plain.csv").answerers is None
+
+
+def test_the_figures_of_each_person_come_from_a_file_too(tmp_path):
+    known = tuple(each._replace(session="monday", replays=each.number) for each in PAST)
+    read = read_questions(write_answers(tmp_path / "answers.csv", known))
+    assert read == tuple(each._replace(newcomer=each.second) for each in known)
+    xr.testing.assert_identical(people(read), people(known))
+    (tmp_path / "plain.csv").write_text("first,second,answer,repeats\n0,1,first,\n1,2,tie,\n1,0,second,1\n")
+    read = read_questions(tmp_path / "plain.csv")
+    assert [(each.number, each.repeats, each.answerer, each.seconds) for each in read] == [
+        (1, None, None, None),
+        (2, None, None, None),
+        (3, 1, None, None),
+    ]
+    assert people(read)["consistent"].values.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("1,0,1,first,,", "line 3: question: expected another number in each line, got 1 twice"),
+        ("2,0,1,first,7,", "line 3: repeats: expected the number of a question above, got 7"),
+        ("2,0,1,first,2,", "line 3: repeats: expected the number of a question above, got 2"),
+        ("2,0,1,first,,soon", "line 3: seconds: expected a number >= 0, got 'soon'"),
+        ("2,0,1,first,,inf", "line 3: seconds: expected a number >= 0, got 'inf'"),
+        ("x,0,1,first,,", "line 3: question: expected a whole number >= 0, got 'x'"),
+        ("2,0,0,first,,", "line 3: second: expected another number than first, got 0 twice"),
+    ],
+)
+def test_a_bad_cell_of_a_question_is_named(tmp_path, row, message):
+    (tmp_path / "answers.csv").write_text(f"question,first,second,answer,repeats,seconds\n1,0,1,tie,,\n{row}\n")
+    with pytest.raises(ValueError, match=re.escape(message)):
+        read_questions(tmp_path / "answers.csv")
 
 
 def test_a_column_in_capitals_is_not_left_out_without_a_word(tmp_path):

@@ -2,9 +2,10 @@
 
 import csv
 import io
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,7 +15,10 @@ from bayespbrl.runs.files import write_file
 
 COLUMNS = ("question", "first", "second", "answer", "answerer", "seconds", "repeats", "session", "replays")
 NEEDED = ("first", "second", "answer")
+COUNTS = ("question", "repeats", "replays")
 GIVEN = [str(answer) for answer in Answer if answer is not Answer.UNDO]
+Line = dict[Any, Any]
+Parsed = TypeVar("Parsed")
 
 
 class CollectedAnswers(NamedTuple):
@@ -68,6 +72,52 @@ def read_answers(file: Path | str) -> CollectedAnswers:
       ValueError: a file that cannot be read, a missing column or one in capitals, or a bad cell, by its line and
         column.
     """
+    rows = _read(file, _row)
+    given = [row for row in rows if row[2] is not Answer.SKIP]
+    ordered = sorted(given, key=lambda row: row[2] is Answer.TIE)  # stable: pairs, then ties
+    every = [(second, first) if answer is Answer.SECOND else (first, second) for first, second, answer, _ in ordered]
+    number = sum(row[2] is not Answer.TIE for row in ordered)
+    names = tuple(row[3] for row in ordered)
+    sides = np.array([-1 if row[2] is Answer.SECOND else 1 for row in ordered], dtype=np.int64)
+    return CollectedAnswers(tuple(every[:number]), tuple(every[number:]), sides, names if any(names) else None)
+
+
+def read_questions(file: Path | str) -> tuple[PastQuestion, ...]:
+    """The questions of such a file with all that is known of each, as `diagnostics.people` takes them.
+
+    Args:
+      file: as of `read_answers`, with any of the columns of `write_answers` besides, whose cells may be empty. Without
+        `question` the lines are counted from 1. Whom a question compared with whom is not in a file: `newcomer` is
+        `second`.
+
+    Raises:
+      ValueError: as `read_answers`; a question that is there twice, or repeats one that is not above it.
+    """
+    past: list[PastQuestion] = []
+
+    def question(line: Line, number: int) -> None:
+        first, second, answer, name = _row(line, number)
+        cells = {column: (line.get(column) or "").strip() for column in COLUMNS}
+        try:
+            counts = {column: _row_number(column, cells[column]) for column in COUNTS if cells[column]}
+            seconds = _seconds(cells["seconds"]) if cells["seconds"] else None
+            asked, repeats = counts.get("question", len(past) + 1), counts.get("repeats")
+            above = {each.number for each in past}
+            if asked in above:
+                raise ValueError(f"question: expected another number in each line, got {asked} twice")
+            if repeats is not None and repeats not in above:
+                raise ValueError(f"repeats: expected the number of a question above, got {repeats}")
+        except ValueError as error:
+            raise ValueError(f"line {number}: {error}") from None
+        shown = (asked, first, second, second, repeats, answer, name or None, seconds)
+        past.append(PastQuestion(*shown, cells["session"] or None, counts.get("replays")))
+
+    _read(file, question)
+    return tuple(past)
+
+
+def _read(file: Path | str, parse: Callable[[Line, int], Parsed]) -> list[Parsed]:
+    """Each line of a CSV file with answers, parsed; the file is named in an error."""
     file = checks.path("file", file)
     try:
         lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig"), newline=""))
@@ -80,19 +130,12 @@ def read_answers(file: Path | str) -> CollectedAnswers:
         for name in lines.fieldnames:
             if name not in COLUMNS and name.lower() in COLUMNS:
                 raise ValueError(f"expected the column {name.lower()} in small letters, got {name}")
-        rows = [_row(line, lines.line_num) for line in lines]
+        return [parse(line, lines.line_num) for line in lines]
     except (OSError, ValueError, csv.Error) as error:
         raise ValueError(f"{file}: {error}") from error
-    given = [row for row in rows if row[2] is not Answer.SKIP]
-    ordered = sorted(given, key=lambda row: row[2] is Answer.TIE)  # stable: pairs, then ties
-    every = [(second, first) if answer is Answer.SECOND else (first, second) for first, second, answer, _ in ordered]
-    number = sum(row[2] is not Answer.TIE for row in ordered)
-    names = tuple(row[3] for row in ordered)
-    sides = np.array([-1 if row[2] is Answer.SECOND else 1 for row in ordered], dtype=np.int64)
-    return CollectedAnswers(tuple(every[:number]), tuple(every[number:]), sides, names if any(names) else None)
 
 
-def _row(line: dict[Any, Any], number: int) -> tuple[int, int, Answer, str]:
+def _row(line: Line, number: int) -> tuple[int, int, Answer, str]:
     try:
         if None in line:
             raise ValueError(f"expected a cell for each column, got {len(line[None] or ())} more")
@@ -111,3 +154,13 @@ def _row_number(column: str, cell: str | None) -> int:
     if not text.isdecimal():
         raise ValueError(f"{column}: expected a whole number >= 0, got {text!r}")
     return int(text)
+
+
+def _seconds(cell: str) -> float:
+    try:
+        seconds = float(cell)
+    except ValueError:
+        seconds = -1.0
+    if not 0 <= seconds < math.inf:
+        raise ValueError(f"seconds: expected a number >= 0, got {cell!r}")
+    return seconds
