@@ -94,7 +94,7 @@ def function_or_name(option: str, given: Choice | str | None, name: str, known: 
     if given is not None and not isinstance(given, str):
         return given
     if name not in known:
-        came = "none" if given is None else repr(given)
+        came = "none" if given in (None, name) else repr(given)
         raise ValueError(f"{option}: expected a function, because the settings say {name!r}, got {came}")
     return known[name]
 

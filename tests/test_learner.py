@@ -781,6 +781,8 @@ def test_a_run_follows_a_query_rule_of_the_users_own_and_goes_on_with_it(tmp_pat
         begun.tell([ReturnExpert()(*query.trajectories) for query in begun.ask()])
     with pytest.raises(ValueError, match=r"expected query= again, which the run was started with, got None"):
         resume(tmp_path / "run")
+    with pytest.raises(ValueError, match=r"query: expected a function, because the settings say 'other', got 'eubo'"):
+        resume(tmp_path / "run", query="eubo")
     whole = resume(tmp_path / "run", query=newest_first).run(ReturnExpert())
     asked = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     newcomers = [event["newcomer"] for event in asked if event["event"] == "asked"]
