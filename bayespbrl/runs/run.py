@@ -151,7 +151,7 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
         for name, space in spaces_of(learner.given).items():
             if log.spaces.get(name, space) != space:
                 raise ValueError(f"env: expected the run's {name}, {log.spaces[name]}, got {space}")
-        if own["features"] is not None and learner.estimate is not None and learner.trajectories:
+        if own["features"] is not None and learner.estimate is not None and learner.estimate.features is not None:
             learner.estimate.utilities(learner.trajectories[0].states[:1])  # as many features as before
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
