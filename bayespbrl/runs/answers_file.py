@@ -93,7 +93,7 @@ def read_questions(file: Path | str) -> tuple[PastQuestion, ...]:
     Raises:
       ValueError: as `read_answers`; a question that is there twice, or repeats one that is not above it.
     """
-    past: list[PastQuestion] = []
+    past: dict[int, PastQuestion] = {}
 
     def question(line: Line, number: int) -> None:
         first, second, answer, name = _row(line, number)
@@ -102,18 +102,17 @@ def read_questions(file: Path | str) -> tuple[PastQuestion, ...]:
             counts = {column: _row_number(column, cells[column]) for column in COUNTS if cells[column]}
             seconds = _seconds(cells["seconds"]) if cells["seconds"] else None
             asked, repeats = counts.get("question", len(past) + 1), counts.get("repeats")
-            above = {each.number for each in past}
-            if asked in above:
+            if asked in past:
                 raise ValueError(f"question: expected another number in each line, got {asked} twice")
-            if repeats is not None and repeats not in above:
+            if repeats is not None and repeats not in past:
                 raise ValueError(f"repeats: expected the number of a question above, got {repeats}")
         except ValueError as error:
             raise ValueError(f"line {number}: {error}") from None
         shown = (asked, first, second, second, repeats, answer, name or None, seconds)
-        past.append(PastQuestion(*shown, cells["session"] or None, counts.get("replays")))
+        past[asked] = PastQuestion(*shown, cells["session"] or None, counts.get("replays"))
 
     _read(file, question)
-    return tuple(past)
+    return tuple(past.values())
 
 
 def _read(file: Path | str, parse: Callable[[Line, int], Parsed]) -> list[Parsed]:
