@@ -76,7 +76,8 @@ def share(name: str, value: Any, *, below_one: bool = False) -> float:
 def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     """`value`, where it is one of `choices`."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+        named = [choice for choice in choices if choice != "other"]  # an object of the user's, which no name can give
+        raise ValueError(f"{name}: expected one of {', '.join(named)}, got {value!r}")
     return str(value)
 
 

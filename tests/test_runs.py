@@ -230,7 +230,8 @@ def test_a_path_that_exists_is_refused_and_nothing_changed(tmp_path, finished, k
     else:
         path.symlink_to(tmp_path / "nowhere")
     before = contents(tmp_path)
-    with pytest.raises(ValueError, match=r"taken: expected a run directory that does not exist yet"):
+    it = "a run, which resume continues" if kind == "run" else "one that exists"
+    with pytest.raises(ValueError, match=rf"taken: expected a run directory that does not exist yet, got {it}"):
         start(path)
     assert contents(tmp_path) == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["taken"]
@@ -812,6 +813,18 @@ def test_features_of_another_number_are_refused(tmp_path):
     assert learner.estimate is not None
     with pytest.raises(ValueError, match=r"run: features: expected \d+ for each state, as before, got"):
         bayespbrl.load(tmp_path / "run", features=lambda states: rows(states)[:, :-1])
+
+
+def test_other_features_of_the_same_number_are_refused(tmp_path):
+    learner = start(tmp_path / "run", features=rows, utility="posterior-mean")
+    learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    bayespbrl.load(tmp_path / "run", features=rows)  # before the first estimate
+    learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    for again in (bayespbrl.load, bayespbrl.resume):
+        again(tmp_path / "run", features=rows)
+    for features in (lambda states: rows(states)[:, ::-1], lambda states: 2 * rows(states)):
+        with pytest.raises(ValueError, match=r"run: features: expected the features of the run, got others: .* off by"):
+            bayespbrl.load(tmp_path / "run", features=features)
 
 
 @pytest.mark.parametrize("path", [None, 3])

@@ -60,7 +60,8 @@ class RunDirectory:
         content["spaces"] = dict(spaces)
         try:
             if path.exists() or path.is_symlink():
-                raise ValueError(f"{path}: expected a run directory that does not exist yet, got one that exists")
+                it = "a run, which resume continues" if (path / "settings.json").exists() else "one that exists"
+                raise ValueError(f"{path}: expected a run directory that does not exist yet, got {it}")
             path.parent.mkdir(parents=True, exist_ok=True)
             building = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
             try:

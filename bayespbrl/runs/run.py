@@ -151,11 +151,29 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
         for name, space in spaces_of(learner.given).items():
             if log.spaces.get(name, space) != space:
                 raise ValueError(f"env: expected the run's {name}, {log.spaces[name]}, got {space}")
-        if own["features"] is not None and learner.estimate is not None and learner.estimate.features is not None:
-            learner.estimate.utilities(learner.trajectories[0].states[:1])  # as many features as before
+        if own["features"] is not None:
+            _check_features(learner)
     except ValueError as error:
         raise ValueError(f"{log.path}: {error}") from error
     return learner
+
+
+def _check_features(learner: Learner) -> None:
+    """`ValueError` where the user's features are as many as before, but others; or not as many."""
+    estimate, state = learner.estimate, learner.state
+    if estimate is None or estimate.features is None:
+        return
+    estimate.utilities(state.trajectories[0].states[:1])
+    if estimate.posterior is None or not estimate.quality.pairs:
+        return
+    now = estimate.differences([state.compared[number] for number in state.preferences.pairs[0]])[:, 0]
+    then = estimate.posterior["constant_data"]["differences"].values[:, 0]
+    away = float(np.max(np.abs(now - then)) / (np.max(np.abs(then)) or 1.0))
+    if not away < 1e-3:  # the same features may be rounded otherwise on another machine
+        raise ValueError(
+            "features: expected the features of the run, got others: the difference of the first two that were "
+            f"compared, in features, is off by {away:.2g} of its largest part"
+        )
 
 
 @dataclass(frozen=True)
