@@ -167,7 +167,7 @@ def _check_features(learner: Learner) -> None:
     if estimate.posterior is None or not estimate.quality.pairs:
         return
     now = estimate.differences([state.compared[number] for number in state.preferences.pairs[0]])[:, 0]
-    then = estimate.posterior["constant_data"]["differences"].values[:, 0]
+    then = estimate.posterior.children["constant_data"].dataset["differences"].values[:, 0]
     away = float(np.max(np.abs(now - then)) / (np.max(np.abs(then)) or 1.0))
     if not away < 1e-3:  # the same features may be rounded otherwise on another machine
         raise ValueError(
