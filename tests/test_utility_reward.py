@@ -96,6 +96,11 @@ def test_a_discrete_task_of_ours_earns_utility_too(gridworld_run):
 def test_other_spaces_and_runs_without_an_estimate_are_refused(pendulum, tmp_path):
     with pytest.raises(ValueError, match=r"^observation_space: expected Box.*, the run's, got Box"):
         UtilityReward(gymnasium.make("CartPole-v1"), pendulum)
+    most = np.array([1.0, 1.0, 8.0])
+    double = gymnasium.wrappers.TransformObservation(
+        gymnasium.make("Pendulum-v1"), lambda observation: observation.astype(np.float64), Box(-most, most, dtype=float)
+    )
+    UtilityReward(double, pendulum)  # the same bounds, of another type
     with pytest.raises(ValueError, match=r"^env: expected an environment, got 'Pendulum-v1'"):
         UtilityReward("Pendulum-v1", pendulum)
     with pytest.raises(ValueError, match=r"^run: expected a run, as bayespbrl.load reads it, got Learner"):

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 
 from bayespbrl import checks
-from bayespbrl.envs.spaces import to_plain
+from bayespbrl.envs.spaces import spaces_of, to_plain
 from bayespbrl.runs.run import Run
 
 DRAWS = 200  # for the standard deviation: known to a twentieth
@@ -39,10 +39,10 @@ class UtilityReward(gymnasium.Wrapper):
         if estimate is None or estimate.features is None:
             kind = "none yet" if estimate is None else type(estimate).__name__
             raise ValueError(f"run: expected a run with an estimate of the utility of states, got {kind}")
-        given = run.learner.given
-        for name in ("observation_space", "action_space"):
-            if getattr(env, name) != getattr(given, name):
-                raise ValueError(f"{name}: expected {getattr(given, name)}, the run's, got {getattr(env, name)}")
+        wanted = spaces_of(run.learner.given)
+        for name, space in spaces_of(self).items():
+            if space != wanted[name]:
+                raise ValueError(f"{name}: expected {wanted[name]}, the run's, got {space}")
         self.caution = checks.number("caution", caution)
         if self.caution and estimate.posterior is None:
             raise ValueError(f"caution: expected 0 for an estimate without a posterior, got {self.caution:g}")
