@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.experimental.functional import FuncEnv
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Sequence, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, OneOf, Sequence, Tuple
 from gymnasium.utils.env_checker import check_env
 from matplotlib.figure import Figure
 from PIL import Image
@@ -336,6 +336,7 @@ def test_the_largest_number_as_a_bound_of_actions_stands_for_none(dtype):
         (Dict(a=Discrete(3), b=Discrete(2)), {"a": 2, "b": 0}, {"a": -1, "b": 0}),
         (Tuple([Discrete(3, start=5), Box(0, 1, (1,))]), (5, np.full(1, 7.0)), (8, np.zeros(1))),
         (MultiBinary(3), [1, 0, 1], [2, 0, 1]),
+        (OneOf([Box(0, 1, (2,)), Discrete(3)]), (0, np.zeros(2, np.float32)), (1, 3)),
     ],
 )
 def test_discrete_parts_outside_their_space_are_refused_and_not_taken_for_others(space, inside, outside):

@@ -88,7 +88,8 @@ def test_a_source_draws_the_diffusion_basis_of_discrete_states_where_it_is_asked
         options = RadialBasisOptions(10, diffusion=diffusion)
         assert isinstance(source.of_states([trajectory], options, rng=rng), kind)
     large = FeatureSource(Discrete(2000), Discrete(2))
-    assert isinstance(large.of_states([trajectory], RadialBasisOptions(10, diffusion=True), rng=rng), OneHot)
+    with pytest.raises(ValueError, match=r"^diffusion_utility: expected at most 1000 states, got 2000$"):
+        large.of_states([trajectory], RadialBasisOptions(10, diffusion=True), rng=rng)
 
 
 def test_one_hot_of_state_and_action_numbers_the_actions_within_a_state():

@@ -22,6 +22,7 @@ from bayespbrl.policies import (
     sample_actions,
     softmax,
 )
+from bayespbrl.policies.choice import fitting
 from bayespbrl.policies.samples import location_and_deviation
 from bayespbrl.policies.spaces import centre_and_range
 
@@ -80,6 +81,13 @@ def a_fitted_policy(kind):
     rng = np.random.default_rng(1)
     observations = some_observations(kind, 400, rng)
     return fit(initial(kind), kind, observations, preferred_actions(kind, observations, rng), np.ones(400))
+
+
+@pytest.mark.parametrize("bound", [1.0, 1e30, float(np.finfo(np.float64).max), np.inf])
+def test_a_policy_fits_spaces_however_wide(bound):
+    wide = Box(-bound, bound, (2,), np.float64)
+    policy = LinearGaussianPolicy.initial(wide, TORQUE)
+    assert fitting(policy, wide, TORQUE) is policy
 
 
 def test_every_policy_is_a_policy():

@@ -3,12 +3,14 @@
 import re
 from dataclasses import dataclass
 from itertools import pairwise
+from unittest import mock
 
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium.envs.functional_jax_env import FunctionalJaxVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.spaces import Box, Discrete
@@ -396,6 +398,29 @@ def test_arrays_that_a_vector_environment_writes_to_anew_are_copied():
         for episode in rollout("Counting-v0", Coin(np.array(0.5)), key=KEY, episodes=2):
             np.testing.assert_array_equal(episode.states[:, 0], range(6))
             np.testing.assert_array_equal(episode.rewards, range(1, 6))
+    finally:
+        del gymnasium.registry["Counting-v0"]
+
+
+class OtherSpaces(CountingSideBySide):
+    """Observes something else than the environment that it is a version of."""
+
+    single_observation_space = Box(0, 255, (3,), np.float64)
+
+
+class OthersStay(CountingSideBySide, FunctionalJaxVectorEnv):
+    """Of the kind whose other lanes stay where they were while one is reset."""
+
+    render_state = None  # for `close`
+
+
+@pytest.mark.parametrize("version", [OtherSpaces, OthersStay])
+def test_a_vector_version_that_is_not_like_the_environment_is_not_used(version):
+    gymnasium.register("Counting-v0", entry_point=Counting, vector_entry_point=version, max_episode_steps=5)
+    try:
+        with mock.patch.object(version, "step", side_effect=AssertionError("used")):
+            (episode, *_) = rollout("Counting-v0", Coin(np.array(0.5)), key=KEY, episodes=2)
+        np.testing.assert_array_equal(episode.states[:, 0], range(6))
     finally:
         del gymnasium.registry["Counting-v0"]
 

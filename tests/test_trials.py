@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -173,6 +174,44 @@ def test_a_second_call_keeps_finished_trials_and_goes_on_with_unfinished_ones(st
     assert (study.path / "trials.nc").exists()
     assert {file: file.stat().st_mtime_ns for file in finished.rglob("*") if file.is_file()} == before
     np.testing.assert_array_equal(again.table["value"].values, values)
+
+
+class Chance(gymnasium.Env):
+    """A walk that ends outside; no seed decides it."""
+
+    observation_space, action_space = gymnasium.spaces.Box(-10, 10, (1,)), gymnasium.spaces.Box(-1, 1, (1,))
+    rng = np.random.default_rng(8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.rng.normal(0, 0.5, 1)
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        self.x = np.clip(self.x + 0.3 * action + self.rng.normal(0, 0.3, 1), -10, 10)
+        return self.x.astype(np.float32), -abs(self.x[0]), bool(abs(self.x[0]) > 1), False, {}
+
+
+def test_trials_of_a_task_that_no_seed_decides_share_what_was_measured(tmp_path):
+    gymnasium.register("Chance-v0", entry_point=Chance, max_episode_steps=100)
+    options = {"answers": 1, "evaluation_episodes": 1, "utility": "linear-program", "restart_iterations": 0}
+    try:
+        row = rows.row_of("Chance-v0", tmp_path / "row", options, seed=1)
+        measured = row.settings.rollouts.trajectories_per_iteration
+        again = [rows.row_of("Chance-v0", tmp_path / "row", options, seed=1) for _ in range(3)]
+        assert {each.settings.rollouts.trajectories_per_iteration for each in again} != {measured}
+        assert rows.run_trial(row, 1)
+        assert load(row.path(1), env="Chance-v0").settings == row.settings
+        assert [each.outcome(1) for each in (row, *again)] == [True] * 4
+    finally:
+        del gymnasium.registry["Chance-v0"]
+
+
+def test_a_trial_of_another_task_is_named(study):
+    with pytest.raises(
+        ValueError, match=r"with these settings, got others: env 'gridworld' instead of 'FrozenLake-v1'"
+    ):
+        rows.row_of("FrozenLake-v1", study.path, QUICK, seed=5).outcome(5)
 
 
 def test_a_directory_with_other_settings_is_refused(study):

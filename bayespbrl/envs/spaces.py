@@ -5,7 +5,18 @@ from typing import Any
 
 import numpy as np
 from gymnasium import Env
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple, flatten, flatten_space
+from gymnasium.spaces import (
+    Box,
+    Dict,
+    Discrete,
+    MultiBinary,
+    MultiDiscrete,
+    OneOf,
+    Space,
+    Tuple,
+    flatten,
+    flatten_space,
+)
 from gymnasium.vector.utils import batch_space, iterate
 
 from bayespbrl import checks
@@ -76,7 +87,9 @@ def to_plain(space: Space[Any], value: Any, actions: Space[Any] | None = None) -
     """
     if isinstance(space, Discrete) and isinstance(actions, Box):
         _check_number(space, value)
-        return np.eye(int(space.n))[int(value - space.start)]
+        row = np.zeros(int(space.n))
+        row[int(value - space.start)] = 1.0
+        return row
     if isinstance(space, Discrete):
         _check_number(space, value, within=False)
         return np.int64(value - space.start)
@@ -111,6 +124,9 @@ def _parts(space: Any, value: Any) -> Iterator[tuple[Any, Any]]:
     elif isinstance(space, Tuple):
         for part, each in zip(space.spaces, value, strict=True):
             yield from _parts(part, each)
+    elif isinstance(space, OneOf):
+        number, each = value
+        yield from _parts(space.spaces[number], each)
     else:
         yield space, value
 

@@ -119,7 +119,9 @@ class FeatureSource:
         if self.own is not None:
             return partial(checked_features, self.own)
         space = self.observation_space
-        if options.diffusion and isinstance(space, Discrete) and space.n <= MOST_CONNECTED:
+        if options.diffusion and isinstance(space, Discrete):
+            if space.n > MOST_CONNECTED:
+                raise ValueError(f"diffusion_utility: expected at most {MOST_CONNECTED} states, got {space.n}")
             return diffusion_basis(trajectories, int(space.n))
         if options.standardised and isinstance(space, Discrete):
             return standardised(trajectories, int(space.n))

@@ -10,6 +10,7 @@ from bayespbrl.learner import Learner
 from bayespbrl.trajectories import clips_of
 
 EPISODES = 100  # of the first policy, for the units of the task's return
+ROUNDING = 1e-9  # relative: equal returns may differ so much in their mean
 IN_UNITS_OF_THE_TASK = ("stochastic", "skipping", "equal", "margin")
 
 
@@ -24,7 +25,7 @@ def expert_of(learner: Learner) -> Expert:
     if settings.expert in IN_UNITS_OF_THE_TASK:
         returns = _first_returns(learner)
         mean, scale = float(returns.mean()), float(returns.std())
-        if scale == 0:
+        if scale <= ROUNDING * np.abs(returns).max():
             raise ValueError(
                 f"expert: expected returns that differ for {settings.expert}, got {mean:g} in all {EPISODES} episodes"
             )

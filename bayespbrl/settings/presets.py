@@ -111,6 +111,8 @@ DEFAULT: dict[str, Any] = {
     "fixed_point_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
     "projection_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
 }
+# Options that random episodes of a task decide, unless they are given.
+MEASURED = ("trajectories_per_iteration", "exploration_hold")
 # Where people answer.
 PEOPLE: dict[str, Any] = {
     "repeats": 0.1,  # a simulated expert would only repeat itself

@@ -48,7 +48,8 @@ class Features:
       constant_utility: whether the utility has a constant part, as in `RadialBasisOptions`, where some episodes end
         before the time limit.
       diffusion_utility: whether the utility of discrete states is smooth over the steps that were observed, with a
-        length scale that is inferred, as in `DiffusionBasis`; else it has an independent value for each state.
+        length scale that is inferred, as in `DiffusionBasis`; else it has an independent value for each state. At most
+        1000 states.
       standardised_utility: whether discrete states have the same part in the utility a priori however often
         trajectories visit them, as in `RadialBasisOptions`; else each visit has.
     """

@@ -17,6 +17,7 @@ from bayespbrl.runs.directory import BASELINE_FILE, FIRST_POLICY_FILE, RunDirect
 from bayespbrl.runs.lock import continuing
 from bayespbrl.runs.simulated import expert_of
 from bayespbrl.settings import Settings, Task, settings_for
+from bayespbrl.settings.presets import MEASURED
 from bayespbrl.studies.baseline_trials import measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
     BALANCING_FILE,
@@ -84,9 +85,7 @@ class Row:
             raise DamagedTrial(str(error)) from error
         if not isinstance(done, list) or any(not isinstance(entry, dict) or "pairs" not in entry for entry in done):
             raise DamagedTrial(f"{path / 'summary.json'}: expected pairs in each iteration, got {str(done)[:60]}")
-        if kept.settings != (wanted := replace(self.settings, seed=seed)):
-            pairs = zip(kept.settings.options().items(), wanted.options().values(), strict=True)
-            others = [f"{name} {kept!r} instead of {here!r}" for (name, kept), here in pairs if kept != here]
+        if others := self._others(kept.settings, seed):
             raise ValueError(f"{path}: expected a trial with these settings, got others: {', '.join(others)}")
         if self.untrained or self.baseline is not None:
             return True if (path / (FIRST_POLICY_FILE if self.untrained else BASELINE_FILE)).exists() else None
@@ -94,6 +93,19 @@ class Row:
             return False
         measured = self.balancing_steps is None or (path / BALANCING_FILE).exists()
         return True if measured and kept.finished() else None
+
+    def _others(self, kept: Settings, seed: int) -> list[str]:
+        """What differs in the settings of a trial, but for what is measured: by chance where no seed decides it."""
+        there = {"env": kept.env} | kept.options()
+        here = {"env": self.settings.env} | replace(self.settings, seed=seed).options()
+        here |= {name: there[name] for name in MEASURED if name not in self.options}
+        return [f"{name} {there[name]!r} instead of {value!r}" for name, value in here.items() if there[name] != value]
+
+    @property
+    def trial_options(self) -> dict[str, Any]:
+        """The options of a trial, with what was measured for the row, so that it is the same for all."""
+        complete = self.settings.options()
+        return {name: complete[name] for name in MEASURED} | self.options
 
     def redraws(self, iterations: int, pairs: int) -> bool:
         """Whether a trial is redrawn: it has no ordered pair after the iterations allowed for the first one."""
@@ -180,7 +192,7 @@ def run_trial(row: Row, seed: int) -> bool:
     if (known := row.outcome(seed)) is not None:
         return known
     try:
-        begun = None if path.exists() else runs.start(row.env, path, **row.options, seed=seed)
+        begun = None if path.exists() else runs.start(row.env, path, **row.trial_options, seed=seed)
     except ValueError:
         if not path.exists():
             raise
