@@ -207,6 +207,12 @@ def test_trials_of_a_task_that_no_seed_decides_share_what_was_measured(tmp_path)
         del gymnasium.registry["Chance-v0"]
 
 
+def test_trials_with_another_number_of_trajectories_are_refused_where_it_is_not_measured(tmp_path):
+    rows.run_trial(rows.row_of("gridworld", tmp_path / "row", QUICK | {"trajectories_per_iteration": 4}, seed=5), 5)
+    with pytest.raises(ValueError, match=r"got others: trajectories_per_iteration 4 instead of 10$"):
+        rows.row_of("gridworld", tmp_path / "row", QUICK, seed=5).outcome(5)
+
+
 def test_a_trial_of_another_task_is_named(study):
     with pytest.raises(
         ValueError, match=r"with these settings, got others: env 'gridworld' instead of 'FrozenLake-v1'"

@@ -111,8 +111,8 @@ DEFAULT: dict[str, Any] = {
     "fixed_point_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
     "projection_ridge": 1e-5,  # 1e-8 is no better on the hidden reward
 }
-# Options that random episodes of a task decide, unless they are given.
-MEASURED = ("trajectories_per_iteration", "exploration_hold")
+# What random episodes of a task decide.
+MEASURED = {"trajectories_per_iteration": Task.more_trajectories, "exploration_hold": Task.longer_hold}
 # Where people answer.
 PEOPLE: dict[str, Any] = {
     "repeats": 0.1,  # a simulated expert would only repeat itself
@@ -120,6 +120,14 @@ PEOPLE: dict[str, Any] = {
     "evaluation_episodes": 20,  # and for these
     "worthwhile": False,  # the page says what an answer is worth, and leaves it to the person to stop
 }
+
+
+def measured_options(env: str, chosen: Mapping[str, Any]) -> tuple[str, ...]:
+    """The names of the options that random episodes decide: neither the user gives them, nor the preset of the task."""
+    if chosen.get("preset", "default") != "default":
+        return ()
+    given = {*TASKS.get(IDS.get(env, env), {}), *chosen}
+    return tuple(name for name in MEASURED if name not in given)
 
 
 def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None) -> dict[str, Any]:
@@ -138,14 +146,10 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
         return {"hyperparameters": "given"} | PAPER.get(name, {})
     expert = chosen.get("expert", "return")
     people = not isinstance(expert, str) or expert not in SIMULATED
-    known = TASKS.get(name, {})
-    options = DEFAULT | ({} if task is None else task.derived(people=people)) | known
-    if task is not None:  # measured only where it matters
-        given = {*known, *chosen}
-        if "trajectories_per_iteration" not in given:
-            options |= task.more_trajectories()
-        if "exploration_hold" not in given:
-            options |= task.longer_hold()
+    options = DEFAULT | ({} if task is None else task.derived(people=people)) | TASKS.get(name, {})
+    if task is not None:
+        for measured in measured_options(env, chosen):
+            options |= MEASURED[measured](task)
     if not chosen.get("checked", True):
         options.pop("noise_free", None)  # such a run keeps the newest policy, with its noise
     if chosen.get("diffusion_utility"):

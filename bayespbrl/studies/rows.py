@@ -17,7 +17,7 @@ from bayespbrl.runs.directory import BASELINE_FILE, FIRST_POLICY_FILE, RunDirect
 from bayespbrl.runs.lock import continuing
 from bayespbrl.runs.simulated import expert_of
 from bayespbrl.settings import Settings, Task, settings_for
-from bayespbrl.settings.presets import MEASURED
+from bayespbrl.settings.presets import measured_options
 from bayespbrl.studies.baseline_trials import measure_baseline, read_baseline
 from bayespbrl.studies.tables import (
     BALANCING_FILE,
@@ -98,14 +98,14 @@ class Row:
         """What differs in the settings of a trial, but for what is measured: by chance where no seed decides it."""
         there = {"env": kept.env} | kept.options()
         here = {"env": self.settings.env} | replace(self.settings, seed=seed).options()
-        here |= {name: there[name] for name in MEASURED if name not in self.options}
+        here |= {name: there[name] for name in measured_options(self.env, self.options)}
         return [f"{name} {there[name]!r} instead of {value!r}" for name, value in here.items() if there[name] != value]
 
     @property
     def trial_options(self) -> dict[str, Any]:
         """The options of a trial, with what was measured for the row, so that it is the same for all."""
         complete = self.settings.options()
-        return {name: complete[name] for name in MEASURED} | self.options
+        return {name: complete[name] for name in measured_options(self.env, self.options)} | self.options
 
     def redraws(self, iterations: int, pairs: int) -> bool:
         """Whether a trial is redrawn: it has no ordered pair after the iterations allowed for the first one."""
