@@ -87,9 +87,7 @@ def to_plain(space: Space[Any], value: Any, actions: Space[Any] | None = None) -
     """
     if isinstance(space, Discrete) and isinstance(actions, Box):
         _check_number(space, value)
-        row = np.zeros(int(space.n))
-        row[int(value - space.start)] = 1.0
-        return row
+        return np.asarray(flatten(space, int(value)), np.float64)
     if isinstance(space, Discrete):
         _check_number(space, value, within=False)
         return np.int64(value - space.start)

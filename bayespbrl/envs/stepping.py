@@ -176,24 +176,22 @@ def _copies(env: gymnasium.Env, lanes: int, time_limit: int | None, *, one_by_on
         and flattened(env.unwrapped) is env.unwrapped
     ):
         vector = gymnasium.make_vec(spec, num_envs=lanes)
-        # In the other modes the last observation of an episode is hidden, or a reset is due that not all of them allow.
-        if vector.metadata.get("autoreset_mode") == AutoresetMode.NEXT_STEP and _as_one(vector, env):
+        if _like_copies(vector, env):
             return vector
         vector.close()
     wrappers: list[Any] = [flattened, _Silent]
     return gymnasium.make_vec(spec, num_envs=lanes, vectorization_mode="sync", wrappers=wrappers, **options)
 
 
-def _as_one(vector: VectorEnv, env: gymnasium.Env) -> bool:
-    """Whether the lanes of an environment's own vector version are like the environment.
-
-    Where one lane is reset, gymnasium's functional ones leave the others where they were.
-    """
-    spaces = (vector.single_observation_space, vector.single_action_space)
-    return not isinstance(vector.unwrapped, FunctionalJaxVectorEnv) and spaces == (
-        env.observation_space,
-        env.action_space,
-    )
+def _like_copies(vector: VectorEnv, env: gymnasium.Env) -> bool:
+    """Whether an environment's own vector version does what copies of it would do side by side."""
+    if isinstance(vector.unwrapped, FunctionalJaxVectorEnv):  # where one lane is reset, the others stay where they were
+        return False
+    # In the other modes the last observation of an episode is hidden, or a reset is due that not all of them allow.
+    if vector.metadata.get("autoreset_mode") != AutoresetMode.NEXT_STEP:
+        return False
+    lane = (vector.single_observation_space, vector.single_action_space)
+    return lane == (env.observation_space, env.action_space)
 
 
 def _batch(

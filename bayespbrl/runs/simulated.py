@@ -5,12 +5,11 @@ import numpy as np
 from jaxtyping import Float
 
 from bayespbrl import rollouts
-from bayespbrl.experts import Expert, NoisyExpert, named_expert
+from bayespbrl.experts import TIE_TOLERANCE, Expert, NoisyExpert, named_expert
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import clips_of
 
 EPISODES = 100  # of the first policy, for the units of the task's return
-ROUNDING = 1e-9  # relative: equal returns may differ so much in their mean
 IN_UNITS_OF_THE_TASK = ("stochastic", "skipping", "equal", "margin")
 
 
@@ -25,7 +24,7 @@ def expert_of(learner: Learner) -> Expert:
     if settings.expert in IN_UNITS_OF_THE_TASK:
         returns = _first_returns(learner)
         mean, scale = float(returns.mean()), float(returns.std())
-        if scale <= ROUNDING * np.abs(returns).max():
+        if scale <= TIE_TOLERANCE * np.abs(returns).max():
             raise ValueError(
                 f"expert: expected returns that differ for {settings.expert}, got {mean:g} in all {EPISODES} episodes"
             )
