@@ -2,10 +2,12 @@
 
 import http.client
 import json
+import logging
 import os
 import queue
 import random
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -333,6 +335,46 @@ def test_a_page_that_is_not_answered_for_long_says_what_to_do_and_goes_on_when_i
         assert answers_of(gridworld) == ["second"]
 
 
+def test_a_page_that_loses_its_program_after_all_answers_says_that_it_can_be_closed(browser, gridworld):
+    gridworld.session.wait(timeout=60)
+    seat = gridworld.session.seats[0]
+    with seat.session.changed:
+        seat.set({**seat.view, "all_given": True})
+    break_off, back, _ = broken_stream(gridworld)
+    with tab_without_views(browser, gridworld, break_off, rate=20) as opened:
+        opened.wait_for_selector(".bp-note >> text=All answers are given and kept. You can close this page.")
+        assert opened.get_attribute(".bp-box", "data-locked") == "true"
+        back.set()
+        opened.wait_for_selector(".bp-note", state="hidden")
+
+
+def test_views_of_one_turn_wait_for_the_same_clips(browser, gridworld):
+    """Each answer of somebody else brings another view; on a slow line the clips then began anew each time."""
+    gridworld.session.wait(timeout=60)
+    seat, asked, held = gridworld.session.seats[0], [], []
+
+    def hold(route):
+        asked.append(route)
+        if len(asked) > 2:
+            return route.continue_()
+        return held.append(route)
+
+    def before(opened):
+        opened.route("**/clip/**", hold)
+
+    with tab(browser, gridworld, ready=".bp-box", before=before) as opened:
+        until(opened, lambda: len(held) == 2)
+        for others in range(1, 4):
+            with seat.session.changed:
+                seat.set({**seat.view, "answered": others})
+            opened.wait_for_timeout(200)
+        for route in held:
+            route.continue_()
+        opened.wait_for_selector(READY)
+        assert opened.inner_text(".bp-count") == "3 answers"
+        assert len(asked) == 2
+
+
 def test_a_key_answers_no_question_whose_clips_are_not_on_the_screen_yet(browser, gridworld):
     slow = """() => {
       const decoded = window.createImageBitmap;
@@ -548,7 +590,15 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
     assert call(gridworld, "POST", f"{token}/answer", good, **foreign)[0] == 403
     assert call(gridworld, "POST", f"{token}/answer", good, Host="example.org")[0] == 403
     assert call(gridworld, "GET", f"{token}/answer")[0] == 405
-    for path in ("/secret", f"/clip/{turn}/2", f"/clip/{turn + 1}/0", "/../page.py"):
+    wrong = (
+        "/secret",
+        f"/clip/{turn}/2",
+        f"/clip/{turn + 1}/0",
+        f"/clip/{turn}/x",
+        f"/clip/{'9' * 5000}/0",
+        "/../page.py",
+    )
+    for path in wrong:
         assert call(gridworld, "GET", token + path)[0] == 404
     assert call(gridworld, "POST", f"{token}/answer", b" " * (LARGEST_BODY + 1))[0] == 413
     nonsense = [
@@ -576,6 +626,25 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
         assert call(gridworld, "POST", f"{token}/answer", json.dumps({"turn": wrong, "answer": "first"}))[0] == 409
     assert gridworld.session.learner.log.log_file.read_bytes() == before
     assert call(gridworld, "POST", f"{token}/answer", good)[0] == 204
+
+
+def test_a_browser_that_hangs_up_and_one_that_wants_a_web_socket_leave_no_traceback(gridworld):
+    gridworld.session.wait(timeout=60)
+    records, handler = [], logging.Handler()
+    handler.emit = records.append
+    logger = logging.getLogger("uvicorn.error")
+    logger.addHandler(handler)
+    try:
+        head = f"POST /{gridworld.token}/answer HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 100\r\n\r\n"
+        with socket.create_connection(("127.0.0.1", gridworld.port)) as connection:
+            connection.sendall(head.encode() + b'{"turn"')
+        upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+        status, _ = call(gridworld, "GET", "/events", **upgrade, **{"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="})
+        assert status == 403
+        assert call(gridworld, "GET", f"/{gridworld.token}/")[0] == 200  # it has seen to the others by then
+    finally:
+        logger.removeHandler(handler)
+    assert not [record.getMessage() for record in records if record.levelno >= logging.ERROR]
 
 
 def test_a_message_that_is_sent_again_is_heard_once_and_one_of_another_window_is_refused(gridworld):

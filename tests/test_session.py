@@ -234,7 +234,10 @@ def test_after_the_last_answer_nobody_needs_to_wait_and_nothing_is_computed_ahea
     assert all(after.complete == (answer == "skip") for (_, answer), after in session._foresight.present.after.items())
     session.answer(1, "first", 2.0)
     assert session.wait((FINISHED,), WAIT)["say"].startswith("Your answer is given")
-    assert {view["say"] for view in views if view["phase"] == THINKING} == {ALL_GIVEN}
+    thinking = [view for view in views if view["phase"] == THINKING]
+    assert {(view["say"], view["all_given"]) for view in thinking} == {(ALL_GIVEN, True)}
+    with pytest.raises(Stale, match=r"turn 2: expected a question that waits, got none \(finished\)"):
+        session.answer(session.view["turn"], "first")
 
 
 def test_a_turn_takes_one_answer_and_an_undo_is_a_turn_of_its_own(sitting):
@@ -445,6 +448,25 @@ def test_an_interrupt_while_an_answer_is_kept_leaves_a_question_that_can_be_answ
     session.answer(view["turn"], "second")
     session.wait(timeout=WAIT)
     assert learner.preferences.answers == 2
+
+
+def test_an_interrupt_right_after_an_answer_is_kept_leaves_a_question_too(sitting, monkeypatch):
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    session, coming = sitting(learner), []
+    turn = session._turn
+
+    def interrupted(seat):
+        if coming:
+            raise coming.pop()
+        turn(seat)
+
+    monkeypatch.setattr(session, "_turn", interrupted)
+    for answer, kept in (("first", 1), ("undo", 0), ("second", 1)):
+        view = session.wait(timeout=WAIT)
+        coming.append(KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            session.answer(view["turn"], answer)
+        assert learner.preferences.answers == kept
 
 
 def test_nobody_is_introduced_to_questions_once_all_answers_are_given(sitting):

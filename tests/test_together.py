@@ -271,6 +271,21 @@ def test_a_sitting_of_several_ends_after_its_answers_and_asks_for_no_more(sittin
     assert session.learner.preferences.answers == 3
 
 
+def test_a_sitting_of_one_answer_shows_one_of_the_questions_that_an_earlier_one_left_open(sitting):
+    first, *_ = sitting()
+    settled(first)
+    first.close()
+    assert len(first.learner.state.open) == 2
+    session, (ada, _), (ben, _) = sitting(first.learner, most_answers=1)
+    settled(session)
+    asked, waits = (ada, ben) if ada.view["phase"] == QUESTION else (ben, ada)
+    assert waits.view["phase"] == WAITING
+    asked.answer(asked.view["turn"], "first")
+    for seat in (ada, ben):
+        seat.wait((FINISHED,), WAIT)
+    assert session.learner.preferences.answers == 1
+
+
 def answered_to_the_end(session, *sitters):
     """Both always say "first", the one and the other in turn: the answered questions by number, and the repeats."""
     turns = 0

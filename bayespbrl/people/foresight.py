@@ -162,13 +162,15 @@ class Foresight:
     def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
         """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.
 
-        A repeated question is left to those who may answer it. No more are looked at than the budget has answers left:
-        once it is spent nobody looks at any, and one that somebody has left open stays open.
+        A repeated question is left to those who may answer it. No more are looked at than the budget has answers left,
+        or the sitting: once the budget is spent nobody looks at any, and one that somebody has left open stays open.
         """
         settings = self.cycle.settings
         left = state.left(settings)
         if state.finished(settings) or left <= 0:
             return {}
+        if self.most is not None:
+            left = min(left, max(1, self.most - state.preferences.answers))
         waiting = {query.number: query for query in state.open}
         holders = {number: who for number, who in before.items() if number in waiting and who in self.people}
         for query in sorted(state.open, key=lambda query: query.answerer not in self.people):

@@ -6,7 +6,8 @@ const listeners = {};
 const fire = (event, message) => (listeners[event] ?? []).forEach((callback) => callback(message));
 const pause = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 const GONE = "The program behind this page does not answer. If it has ended, start it again and open the address that it prints.";
-const ELSEWHERE = "This question was answered in another window, or by another person. That answer counts, and yours does not.";
+const ELSEWHERE = "Your answer was not kept: this question was answered in another window or by another person, or was not yours any more after the connection was lost.";
+const DONE = "All answers are given and kept. You can close this page.";
 const SILENCE = 25; // seconds without a sign of life after which a connection is dead: page.py sends one every ten
 const REPLY = 15, CLIP = 60; // seconds within which the server replies, on a slow line too
 const PATIENCE = 20; // seconds without a server until the page says that it may have ended, and tries less often
@@ -42,21 +43,30 @@ async function post(message) {
 }
 
 let fetched = null; // the turn whose clips are here
+let coming = null; // those that are on their way, and of which turn
 let newest = 0;
+
+async function clipsOf(turn) {
+  return Promise.all([0, 1].map(async (side) => {
+    const reply = await fetch(`clip/${turn}/${side}`, { signal: AbortSignal.timeout(1000 * CLIP) });
+    if (!reply.ok) throw new Error(reply.statusText);
+    return new Uint8Array(await reply.arrayBuffer());
+  }));
+}
 
 async function take(view) {
   const mine = ++newest;
   if (view.phase === "question" && view.turn !== fetched) {
+    // each answer of somebody else brings a view of the same turn: all of them wait for the same clips
+    if (coming?.turn !== view.turn) coming = { turn: view.turn, clips: clipsOf(view.turn) };
+    const awaited = coming;
     try {
-      const sheets = await Promise.all([0, 1].map(async (side) => {
-        const reply = await fetch(`clip/${view.turn}/${side}`, { signal: AbortSignal.timeout(1000 * CLIP) });
-        if (!reply.ok) throw new Error(reply.statusText);
-        return new Uint8Array(await reply.arrayBuffer());
-      }));
+      const sheets = await awaited.clips;
       if (mine !== newest) return;
       [state.first, state.second] = sheets;
       fetched = view.turn;
     } catch {
+      if (coming === awaited) coming = null;
       if (mine !== newest) return;
       await pause(500); // the next view may be here by then
       if (mine === newest && !over()) await take(view);
@@ -80,7 +90,8 @@ function back() {
 async function missed() {
   lost ??= performance.now();
   const gone = performance.now() - lost > 1000 * PATIENCE;
-  fire("msg:custom", gone ? { connection: "gone", say: GONE } : { connection: "lost" });
+  if (state.view.all_given) fire("msg:custom", { connection: "gone", say: DONE });
+  else fire("msg:custom", gone ? { connection: "gone", say: GONE } : { connection: "lost" });
   await pause(gone ? 3000 : 500);
 }
 

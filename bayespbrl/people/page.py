@@ -18,7 +18,7 @@ from importlib.resources import files
 import uvicorn
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -83,7 +83,12 @@ class Page:
             ) from error
         self.host, self.port = host, self._socket.getsockname()[1]
         config = uvicorn.Config(
-            self._application(), log_level="warning", access_log=False, timeout_graceful_shutdown=1, lifespan="off"
+            self._application(),
+            log_level="warning",
+            access_log=False,
+            timeout_graceful_shutdown=1,
+            lifespan="off",
+            ws="none",
         )
         self._server = _Server(config)
 
@@ -126,7 +131,7 @@ class Page:
         routes = [
             Route("/", self._home),
             Route("/events", self._events),
-            Route("/clip/{turn:int}/{side:int}", self._clip),
+            Route("/clip/{turn}/{side}", self._clip),
             Route("/answer", self._answer, methods=["POST"]),
             *(Route(f"/{name}", self._file) for name in KINDS),
         ]
@@ -143,8 +148,8 @@ class Page:
     async def _clip(self, request: Request) -> Response:
         turn, side = request.path_params["turn"], request.path_params["side"]
         try:
-            sheet = seat_of(request).sheet(turn, side) if side in (0, 1) else None
-        except Stale:
+            sheet = seat_of(request).sheet(int(turn), ("0", "1").index(side))
+        except ValueError:  # no number, one of too many digits, or of a turn that is over
             sheet = None
         if sheet is None:
             return PlainTextResponse("clip: expected one of the present question", 404)
@@ -156,6 +161,8 @@ class Page:
             body = await _bounded(request)
         except OverflowError:
             return PlainTextResponse(f"body: expected at most {LARGEST_BODY} bytes", 413)
+        except ClientDisconnect:  # nobody hears what is said then
+            return Response(status_code=400)
         try:
             message, key = answer_of(json.loads(body)), request.headers.get("idempotency-key")
             await asyncio.to_thread(self._take, seat_of(request), key, *message)

@@ -158,16 +158,23 @@ class Session:
         with self.changed:
             if self._closing:
                 raise Stale("session: expected an open one, got one that is closed")
-            if turn != seat.turn or seat.view["phase"] not in (INSTRUCTIONS, QUESTION):
+            if turn != seat.turn:
                 raise Stale(f"turn: expected {seat.turn}, got {turn}")
-            if (introduction := self._introducing(seat)) is not None:
-                introduction.answer(answer)
-                self._turn(seat)
-            elif answer == Answer.UNDO:
-                self._undo(seat)
-            else:
-                self._take(seat, answer, seconds, replays)
-            self._settle()
+            if (phase := seat.view["phase"]) not in (INSTRUCTIONS, QUESTION):
+                raise Stale(f"turn {turn}: expected a question that waits, got none ({phase})")
+            try:
+                if (introduction := self._introducing(seat)) is not None:
+                    introduction.answer(answer)
+                    self._turn(seat)
+                elif answer == Answer.UNDO:
+                    self._undo(seat)
+                else:
+                    self._take(seat, answer, seconds, replays)
+                self._settle()
+            except KeyboardInterrupt:  # of a notebook's kernel; what is kept by now holds
+                self._foresight.again(self.learner.state)
+                self._settle()
+                raise
 
     def _turn(self, seat: Seat) -> None:
         """The next turn of one person."""
@@ -196,10 +203,6 @@ class Session:
                 self.learner.record(entry)
         except Exception as error:  # a full disk, or another learner in the run: this answer is kept all the same
             self._failed(moment, error)
-        except BaseException:  # a notebook's kernel is interrupted
-            self._foresight.again(self.learner.state)
-            self._settle()
-            raise
 
     def _record(self, entry: Entry) -> None:
         """Keep what a person said; `ValueError` where the disk is full or read-only. Nothing has happened then."""

@@ -53,6 +53,7 @@ def described(learner: Learner, state: LearnerState, phase: str, *, turn: int, a
         "iteration": state.iteration,
         "undo": state.may_undo(answerer),
         "answerer": answerer,
+        "all_given": given_all,
         "practice": None,
         "notice": "",
         "say": ALL_GIVEN if given_all and phase == THINKING else "",
