@@ -4,13 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.special import logsumexp
+from scipy import stats
 
 from bayespbrl.models import PreferenceModel, fit_gaussian, priors, refraction, sample_posterior, step_moves
 from bayespbrl.models.chains import FEW, Chains, flight_draw
 from bayespbrl.models.convergence import chain_convergence
+from bayespbrl.models.coordinate_sweep import MOST_ANSWERS, sweep_of, sweep_move
 from bayespbrl.models.elliptical_slice import elliptical_moves, independent_move
 from bayespbrl.models.gaussian_fit import refitted
-from bayespbrl.models.likelihoods import likelihood_of, prob
+from bayespbrl.models.likelihoods import likelihood_of, log_prob, prob
 from bayespbrl.models.preference_problem import axis_ellipse, padded_problem, reference_ellipse
 from bayespbrl.models.split_dynamics import split_move
 
@@ -78,17 +81,24 @@ def test_answers_none_of_them_a_lapse_are_sampled_as_with_hardly_any():
     assert np.all(none.mean(axis=(0, 1)) > 0)
 
 
+def moves_among_steps(monkeypatch, kind):
+    """Flights alone, or with lapse rates that take the weights along, or with these and sweeps."""
+    monkeypatch.setattr(step_moves, "MANY_DIMENSIONS", 2**20 if kind == "flights" else 0)
+    if kind != "sweeps":
+        monkeypatch.setattr(step_moves, "sweep_of", lambda *_, **__: None)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("transport", [False, True])
-def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterior_of_quadrature(transport, monkeypatch):
-    monkeypatch.setattr(step_moves, "MANY_DIMENSIONS", 0 if transport else 2**20)
+@pytest.mark.parametrize("kind", ["flights", "transport", "sweeps"])
+def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterior_of_quadrature(kind, monkeypatch):
+    moves_among_steps(monkeypatch, kind)
     rows = answers(12, seed=7)
     rows = np.concatenate([rows, -0.5 * rows[:1], 2 * rows[1:2]])  # a wall of two answers for each of two
     fit = fit_gaussian(rows, PreferenceModel(steepness=None, lapse_rate=None))
     with jax.enable_x64(True):
         chains = Chains.start([fit], num_chains=8, chunk=25, seed=0)
         problem, steps = chains.problem, step_moves.steps_of([fit], chains.problem)
-        assert (steps.ladder is not None) == transport
+        assert [steps.ladder is not None, steps.sweep is not None] == [kind != "flights", kind == "sweeps"]
 
         def step(state, _):
             *state, _ = flight_draw(*state, problem, steps)
@@ -108,9 +118,9 @@ def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterio
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("transport", [False, True])
-def test_moves_among_steps_sample_the_lapse_rate_of_each_of_two_people_as_by_quadrature(transport, monkeypatch):
-    monkeypatch.setattr(step_moves, "MANY_DIMENSIONS", 0 if transport else 2**20)
+@pytest.mark.parametrize("kind", ["flights", "transport", "sweeps"])
+def test_moves_among_steps_sample_the_lapse_rate_of_each_of_two_people_as_by_quadrature(kind, monkeypatch):
+    moves_among_steps(monkeypatch, kind)
     rows = answers(16, seed=7, wrong=0.0)
     rows[12:] *= -1  # the second person errs in four of six answers
     who = np.arange(16) >= 10
@@ -167,6 +177,98 @@ def test_a_flight_that_is_given_up_leaves_the_weights_where_they_are(monkeypatch
 def test_a_draw_says_so_where_any_of_its_flights_was_given_up(monkeypatch):
     _, _, given_up = flown_from_one_point(monkeypatch, model=PreferenceModel(lapse_rate=None), walls=4)
     assert given_up.mean() > 0.4  # of single flights one in twenty is
+
+
+@pytest.mark.slow
+def test_sweeps_alone_sample_the_posterior_of_quadrature():
+    """Two people answer, sometimes wrongly, about one utility or two, of three weights with a common part."""
+    rng, rows = np.random.default_rng(3), np.zeros((13, 3))
+    for row, (first, second) in zip(rows, [(1, 0), (0, 1), (1, 1), (1, -1)] * 3 + [(-1, 1)], strict=True):
+        row[:2] = rng.uniform(0.5, 2.0, 2) * (first, second)
+    rows[:, 2] = -rows[:, 0]
+    rows *= np.where(rng.random(13) < 0.3, -1, 1)[:, None]
+    who, scale = np.stack([np.arange(13) < 6, np.arange(13) >= 6]).astype(float), 0.8
+    fit = fit_gaussian(rows, PreferenceModel(scale, 1.0, None))
+    rates, shares = priors.LAPSE_RATE
+    with jax.enable_x64(True):
+        chains = Chains.start([fit], num_chains=8, chunk=25, seed=0, by_answerer=who)
+        problem, steps = chains.problem, step_moves.steps_of([fit], chains.problem)
+        normals, rank = steps.walls.normals[0], problem.settings.loadings.shape[2]
+        sweep = sweep_of(rows, fit.factors.basis, np.asarray(problem.answerers), prior_scale=scale, rank=rank)
+        of_two = jax.device_put((who, rates[:, None], np.log(shares)[:, None]))
+
+        def log_likelihood(margins):
+            who, rates, log_shares = of_two
+            p = jnp.exp(log_prob(likelihood_of("mixed", 13.0, steepness=1.0), margins[..., None, :13]))
+            log_p = jnp.log(rates / 2 + (1 - rates) * p) @ who.T
+            return jnp.sum(logsumexp(log_p + log_shares, axis=-2), axis=-1)
+
+        def step(y, key):
+            known = {"normals": normals, "heights": steps.heights, "log_likelihood": log_likelihood}
+            y, margins = sweep_move(key, y, normals @ y, sweep, **known)
+            return y, (y, margins)
+
+        keys = jax.random.split(jax.random.key(1), (8, 4000))
+        run = jax.jit(jax.vmap(lambda y, keys: jax.lax.scan(step, y, keys)[1]))
+        start = chains.state.z["utility_weights"] / scale
+        y, margins = map(np.asarray, run(start, keys))
+        points = POINTS + (GRID[1] - GRID[0]) / 2  # not where a coordinate is zero, where the likelihood jumps
+        density = (
+            np.asarray(log_likelihood(points @ fit.factors.loadings.T)) - 0.5 * np.sum(points**2, axis=1) / scale**2
+        )
+        np.testing.assert_allclose(margins, y @ np.asarray(normals).T, atol=1e-12)
+        np.testing.assert_array_equal(y[:, -1, 2:], start[:, 2:])  # padding
+    mass = np.exp(density - density.max())
+    mass /= mass.sum()
+    draws = scale * y[:, 50:, :2]
+    draws = np.concatenate([draws, draws**2, draws[..., :1] * draws[..., 1:]], axis=2)
+    expected = [*(mass @ points), *(mass @ points**2), mass @ np.prod(points, axis=1)]
+    error = chain_convergence(draws).monte_carlo_error
+    assert np.all(np.abs(draws.mean(axis=(0, 1)) - expected) < 4 * error)
+    assert np.all(error < 0.03 * draws.std(axis=(0, 1)))
+
+
+def test_a_weight_far_in_the_tail_of_its_prior_is_drawn_beyond_its_step():
+    rows = np.array([[1.0, -1.0]])
+    with jax.enable_x64(True):
+        sweep = sweep_of(rows, np.eye(2), np.ones((1, 1)), prior_scale=1.0, rank=2)
+        one = np.flatnonzero(np.asarray(sweep.blocks[0].weights)[:, 0] == 0)  # the other weight stays
+        sweep = sweep._replace(blocks=(jax.tree.map(lambda part: part[one], sweep.blocks[0]),))
+        normals, heights, y = jax.device_put((rows, np.array([[0.0, -1e5]]), np.array([9.5, 9.0])))
+
+        def moved(key):
+            known = {"normals": normals, "heights": heights, "log_likelihood": lambda t: heights[0, jnp.sum(t < 0)]}
+            return sweep_move(key, y, normals @ y, sweep, **known)[0]
+
+        drawn = np.asarray(jax.vmap(moved)(jax.random.split(jax.random.key(0), 1000)))
+    assert np.all(drawn[:, 1] == 9.0)
+    law = stats.truncnorm(9.0, np.inf)
+    assert stats.kstest(drawn[:, 0], law.cdf).pvalue > 0.001
+
+
+def test_weights_of_a_block_share_no_answer_and_each_that_few_answers_touch_is_in_one():
+    rng = np.random.default_rng(0)
+    first = rng.integers(0, 299, 600)  # the last item is compared with none
+    rows = np.eye(300)[first] - np.eye(300)[(first + rng.integers(1, 298, 600)) % 299]
+    rows = np.concatenate([rows, rng.choice([-0.2, 0.2], (600, 1))], axis=1)  # which was shown first
+    answerers, basis = np.ones((1, 640)), np.eye(301)[:, :256]
+    sweep = sweep_of(rows, basis, answerers, prior_scale=2.0, rank=288)
+    assert [blocks.answers.shape[2] for blocks in sweep.blocks] == [4, 8, 16]
+    found = []
+    for blocks in sweep.blocks:
+        for weights, answers, slopes in zip(*map(np.asarray, blocks), strict=True):
+            real = slopes != 0
+            assert len(set(answers[real])) == real.sum()
+            assert np.all(answers[~real] == 640)
+            for weight, of_it, own, there in zip(weights, answers, slopes, real, strict=True):
+                if weight < 301:
+                    np.testing.assert_array_equal(of_it[there], np.flatnonzero(rows[:, weight]))
+                    np.testing.assert_array_equal(own[there], 2 * rows[of_it[there], weight])
+            found.extend(weights[weights < 301])
+    assert sorted(found) == np.flatnonzero(np.any(rows[:, :300] != 0, axis=0)).tolist()
+    dense = np.ones((MOST_ANSWERS + 1, 40))
+    assert sweep_of(dense, np.eye(40), np.ones((1, 40)), prior_scale=1.0, rank=40) is None
+    assert sweep_of(dense[1:], np.eye(40), np.ones((1, 40)), prior_scale=1.0, rank=40) is not None
 
 
 @pytest.mark.parametrize(

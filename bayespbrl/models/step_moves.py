@@ -10,6 +10,7 @@ from jax import Array, lax, random
 from jax.scipy.special import logsumexp
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from bayespbrl.models.coordinate_sweep import Sweep, sweep_move, sweep_of
 from bayespbrl.models.expectation_propagation import same_margins
 from bayespbrl.models.gaussian_fit import GaussianFit
 from bayespbrl.models.gibbs import (
@@ -27,7 +28,7 @@ from bayespbrl.models.refraction import Walls, flight_move, walls_of
 
 # Dimensions from which few answers decide about each, so that the lapse rate takes the weights along.
 MANY_DIMENSIONS = 64
-# Flights of a draw there: the number of violated answers changes little in each.
+# Flights of a draw there, where no sweep changes the number of violated answers: each changes it little.
 FLIGHTS = 12
 BESIDE = 1e-300  # a margin on one side of the step
 
@@ -42,11 +43,13 @@ class Steps(NamedTuple):
       walls: of each setting, stacked.
       heights: log likelihood by the number of violated answers of each answerer, with the lapse rate summed out.
       ladder: of each setting, stacked; None: lapse rates move alone.
+      sweep: through the weights, where few answers touch each, in many dimensions and one setting; else None.
     """
 
     walls: Walls
     heights: Float[Array, "a n"]
     ladder: Ladder | None
+    sweep: Sweep | None
 
 
 def steps_of(fits: Sequence[GaussianFit], problem: JointProblem) -> Steps:
@@ -58,17 +61,23 @@ def steps_of(fits: Sequence[GaussianFit], problem: JointProblem) -> Steps:
     moving = len(problem.lapse_rate.values) > 1 and loadings.shape[2] > MANY_DIMENSIONS
     ranks = [fit.factors.loadings.shape[1] for fit in fits] if moving else []
     ladders = [ladder_of(scale * rows, rank) for rows, rank in zip(loadings, ranks, strict=False)]
-    return Steps(_stacked(walls), _heights(problem), _stacked(ladders) if moving else None)
+    sweep = None
+    if len(fits) == 1 and loadings.shape[2] > MANY_DIMENSIONS:
+        sweep = sweep_of(
+            fits[0].differences, fits[0].factors.basis, answerers, prior_scale=scale, rank=loadings.shape[2]
+        )
+    return Steps(_stacked(walls), _heights(problem), _stacked(ladders) if moving else None, sweep)
 
 
 def step_moves(
     key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem, steps: Steps
 ) -> tuple[Float[Array, " q"], Unknowns, Bool[Array, ""]]:
-    """Flights, lapse rates drawn after them and then with the weights.
+    """Sweeps and flights, lapse rates drawn after them and then with the weights.
 
     Returns:
       the weights, the unknowns, and whether a flight was given up.
     """
+    key_sweep, key = random.split(key) if steps.sweep is not None else (key, key)
     keys, y = random.split(key, 3), z / problem.settings.prior_scale
     walls = at_setting(steps.walls, unknowns.setting)
     margins = walls.normals @ y
@@ -77,6 +86,9 @@ def step_moves(
         every = point_of(problem, unknowns)._replace(lapse_rate=problem.lapse_rate.values[:, None])
         log_p = jnp.atleast_2d(log_probabilities(problem, every, margins))  # one row where no answer can be a lapse
         return problem.answerers @ log_p.T + problem.lapse_rate.log_probabilities
+
+    def total(margins: Float[Array, " c"]) -> Float[Array, ""]:
+        return jnp.sum(logsumexp(lapse_weights(margins), axis=1))
 
     def flight(now: _InFlight, key: PRNGKeyArray) -> tuple[_InFlight, None]:
         y, margins, given_up = now
@@ -87,12 +99,16 @@ def step_moves(
             margins=margins,
             violated=problem.answerers @ (margins < 0),
             heights=steps.heights,
-            log_likelihood=lambda margins: jnp.sum(logsumexp(lapse_weights(margins), axis=1)),
+            log_likelihood=total,
         )
         return (y, margins, given_up | this_given_up), None
 
+    if steps.sweep is not None:
+        y, margins = sweep_move(
+            key_sweep, y, margins, steps.sweep, normals=walls.normals, heights=steps.heights, log_likelihood=total
+        )
     now = (y, margins, jnp.zeros((), bool))
-    if steps.ladder is None:
+    if steps.ladder is None or steps.sweep is not None:
         now, _ = flight(now, keys[0])
     else:
         now, _ = lax.scan(flight, now, random.split(keys[0], FLIGHTS))
