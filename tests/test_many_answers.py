@@ -152,7 +152,7 @@ def test_moves_among_steps_sample_the_lapse_rate_of_each_of_two_people_as_by_qua
 
 def flown_from_one_point(monkeypatch, *, model, walls):
     """That point, where 64 calls of the moves lead from it, and whether a flight met more walls than so many."""
-    monkeypatch.setattr(step_moves, "MANY_DIMENSIONS", 0)
+    moves_among_steps(monkeypatch, "transport")
     fit = fit_gaussian(answers(12, seed=7), model)
     with jax.enable_x64(True):
         chains = Chains.start([fit], num_chains=1, chunk=25, seed=0)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax, random
 from jax.scipy.special import ndtri
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 # A weight that more answers touch is not drawn here. Where it is too large a part of all, none is.
 MOST_ANSWERS, LEAST_SHARE = 32, 0.9
@@ -163,45 +163,26 @@ def _block_move(
     before = margins.at[answers].get(mode="fill", fill_value=0.0)
     whose = answerers.at[:, answers].get(mode="fill", fill_value=0.0)
     others = before - slopes * now[:, None]
-    # an interval begins at each step, and one before all; padded answers have their step behind all others
-    steps = jnp.where(slopes != 0, -others / jnp.where(slopes != 0, slopes, 1.0), jnp.inf)
-    each = jnp.arange(steps.shape[1])
-    earlier = (steps[:, :, None] < steps[:, None]) | (
-        (steps[:, :, None] == steps[:, None]) & (each[:, None] <= each)
-    )  # at or before: step, interval
-    first = jnp.full((len(steps), 1), -jnp.inf)
-    low = jnp.concatenate([first, steps], axis=1)
-    next_step = jnp.min(jnp.where(earlier, jnp.inf, steps[:, :, None]), axis=1)
-    high = jnp.concatenate([jnp.min(steps, axis=1, keepdims=True), next_step], axis=1)
-    tail, beyond = _tail(low), _tail(high)
-    mass = jnp.where((low < 0) & (high > 0), 1 - tail - beyond, jnp.abs(tail - beyond))
+    intervals = _intervals(others, slopes)
 
-    def priced(violated: Float[Array, " a"]) -> tuple[Array, Array, Array]:
-        """By so many violated answers: the price of each, and each interval's share times a factor, whose log it is."""
+    def priced(violated: Float[Array, " a"]) -> tuple[Float[Array, "s n"], Float[Array, "s m"], Float[Array, " s"]]:
+        """The price of an answer by so many violated ones, each interval's share, and the log of the shares' factor."""
         each = jnp.einsum("a,asn->sn", _at(heights, violated - 1) - _at(heights, violated + 1), whose) / 2
         left = jnp.sum(jnp.where(slopes > 0, each, 0.0), axis=1, keepdims=True)
-        passed = jnp.sum(jnp.where(earlier, jnp.where(slopes > 0, -each, each)[:, :, None], 0.0), axis=1)
+        passed = jnp.where(slopes > 0, -each, each)[:, :, None]
+        passed = jnp.sum(jnp.where(intervals.earlier, passed, 0.0), axis=1)
         price = left + jnp.concatenate([jnp.zeros_like(left), passed], axis=1)
-        least = jnp.min(jnp.where(mass > 0, price, jnp.inf), axis=1)
-        return each, mass * jnp.exp(least[:, None] - price), least
+        least = jnp.min(jnp.where(intervals.mass > 0, price, jnp.inf), axis=1)
+        return each, intervals.mass * jnp.exp(least[:, None] - price), least
 
     prices, shares, least = priced(violated)
-    reached = jnp.cumsum(shares, axis=1)
-    place = reached[:, -1] * random.uniform(key_place, now.shape, dtype=now.dtype)
-    passed = jnp.concatenate([jnp.zeros_like(reached[:, :1]), reached[:, :-1]], axis=1)
-    chosen = (reached > place[:, None]) & (passed <= place[:, None])
-    low, high, tail, beyond, there, until, after = (
-        jnp.sum(jnp.where(chosen, part, 0.0), axis=1) for part in (low, high, tail, beyond, mass, passed, reached)
-    )
-    part = jnp.where(low > 0, after - place, place - until) / (after - until)
-    quantile = ndtri(jnp.where(low > 0, beyond, tail) + part * there)
-    new = jnp.clip(jnp.where(low > 0, -quantile, quantile), low, high)
+    new = _drawn(key_place, intervals, shares)
     after = others + slopes * new[:, None]
     then = violated + jnp.einsum("asn,sn->a", whose, (after < 0) * 1.0 - (before < 0))
     prices_then, shares_then, least_then = priced(then)
     # the ratio of Metropolis and Hastings: heights, and the proposals' densities there and back, but for the prior's
     gained = jnp.sum(_at(heights, then) - _at(heights, violated)) + jnp.sum(least_then - least)
-    gained += jnp.sum(jnp.log(reached[:, -1]) - jnp.log(jnp.sum(shares_then, axis=1)))
+    gained += jnp.sum(jnp.log(jnp.sum(shares, axis=1)) - jnp.log(jnp.sum(shares_then, axis=1)))
     gained += jnp.sum(prices * (after < 0)) - jnp.sum(prices_then * (before < 0))
     accepted = jnp.log(random.uniform(key_test, dtype=now.dtype)) < gained
     return (
@@ -211,9 +192,49 @@ def _block_move(
     )
 
 
-def _tail(x: Float[Array, "s m"]) -> Float[Array, "s m"]:
-    """The normal probability beyond |x|: the other side has no digits left where x is large."""
-    return 0.5 * lax.erfc(jnp.abs(x) / np.sqrt(2))
+class _Intervals(NamedTuple):
+    """Where the likelihood of each weight is constant: before all its steps, and from each step to the next.
+
+    Attributes:
+      low, high: their ends.
+      tail, beyond: normal probability beyond |low| and |high|: of these, digits are left where an end is large.
+      mass: normal probability between the ends.
+      earlier: which steps (second axis) are not behind the one where an interval begins (third axis).
+    """
+
+    low: Float[Array, "s m"]
+    high: Float[Array, "s m"]
+    tail: Float[Array, "s m"]
+    beyond: Float[Array, "s m"]
+    mass: Float[Array, "s m"]
+    earlier: Bool[Array, "s n n"]
+
+
+def _intervals(others: Float[Array, "s n"], slopes: Float[Array, "s n"]) -> _Intervals:
+    """The intervals of weights; `others` are the margins without them. Padded answers have their step behind all."""
+    steps = jnp.where(slopes != 0, -others / jnp.where(slopes != 0, slopes, 1.0), jnp.inf)
+    each, step, begin = jnp.arange(steps.shape[1]), steps[:, :, None], steps[:, None]
+    earlier = (step < begin) | ((step == begin) & (each[:, None] <= each))
+    low = jnp.concatenate([jnp.full((len(steps), 1), -jnp.inf), steps], axis=1)
+    following = jnp.min(jnp.where(earlier, jnp.inf, step), axis=1)
+    high = jnp.concatenate([jnp.min(steps, axis=1, keepdims=True), following], axis=1)
+    tail, beyond = (0.5 * lax.erfc(jnp.abs(end) / np.sqrt(2)) for end in (low, high))
+    mass = jnp.where((low < 0) & (high > 0), 1 - tail - beyond, jnp.abs(tail - beyond))
+    return _Intervals(low, high, tail, beyond, mass, earlier)
+
+
+def _drawn(key: PRNGKeyArray, intervals: _Intervals, shares: Float[Array, "s m"]) -> Float[Array, " s"]:
+    """A weight each: an interval by its share, and a place in it by the normal distribution, of one random number."""
+    reached = jnp.cumsum(shares, axis=1)
+    until = jnp.concatenate([jnp.zeros_like(reached[:, :1]), reached[:, :-1]], axis=1)
+    place = reached[:, -1:] * random.uniform(key, (len(shares), 1), dtype=shares.dtype)
+    chosen = (until <= place) & (place < reached)
+    low, high, tail, beyond, mass, begin, end = (
+        jnp.sum(jnp.where(chosen, part, 0.0), axis=1) for part in (*intervals[:5], until, reached)
+    )
+    part = jnp.where(low > 0, end - place[:, 0], place[:, 0] - begin) / (end - begin)
+    quantile = ndtri(jnp.where(low > 0, beyond, tail) + part * mass)
+    return jnp.clip(jnp.where(low > 0, -quantile, quantile), low, high)
 
 
 def _at(heights: Float[Array, "a v"], violated: Float[Array, " a"]) -> Float[Array, " a"]:
