@@ -10,7 +10,7 @@ from scipy import stats
 from bayespbrl.models import PreferenceModel, fit_gaussian, priors, refraction, sample_posterior, step_moves
 from bayespbrl.models.chains import FEW, Chains, flight_draw
 from bayespbrl.models.convergence import chain_convergence
-from bayespbrl.models.coordinate_sweep import MOST_ANSWERS, sweep_of, sweep_move
+from bayespbrl.models.coordinate_sweep import MOST_ANSWERS, sweep_move, sweep_of
 from bayespbrl.models.elliptical_slice import elliptical_moves, independent_move
 from bayespbrl.models.gaussian_fit import refitted
 from bayespbrl.models.likelihoods import likelihood_of, log_prob, prob
