@@ -10,7 +10,7 @@ from scipy import stats
 from bayespbrl.models import PreferenceModel, fit_gaussian, priors, refraction, sample_posterior, step_moves
 from bayespbrl.models.chains import FEW, Chains, flight_draw
 from bayespbrl.models.convergence import chain_convergence
-from bayespbrl.models.coordinate_sweep import MOST_ANSWERS, sweep_move, sweep_of
+from bayespbrl.models.coordinate_sweep import forth_and_back, sweep_move, sweep_of
 from bayespbrl.models.elliptical_slice import elliptical_moves, independent_move
 from bayespbrl.models.gaussian_fit import refitted
 from bayespbrl.models.likelihoods import likelihood_of, log_prob, prob
@@ -254,21 +254,30 @@ def test_weights_of_a_block_share_no_answer_and_each_that_few_answers_touch_is_i
     answerers, basis = np.ones((1, 640)), np.eye(301)[:, :256]
     sweep = sweep_of(rows, basis, answerers, prior_scale=2.0, rank=288)
     assert [blocks.answers.shape[2] for blocks in sweep.blocks] == [4, 8, 16]
-    found = []
+    some, found = np.flatnonzero(np.any(rows != 0, axis=0)), []
+    np.testing.assert_array_equal(np.asarray(sweep.basis)[: len(some), :256], basis[some])
     for blocks in sweep.blocks:
         for weights, answers, slopes in zip(*map(np.asarray, blocks), strict=True):
             real = slopes != 0
             assert len(set(answers[real])) == real.sum()
             assert np.all(answers[~real] == 640)
             for weight, of_it, own, there in zip(weights, answers, slopes, real, strict=True):
-                if weight < 301:
-                    np.testing.assert_array_equal(of_it[there], np.flatnonzero(rows[:, weight]))
-                    np.testing.assert_array_equal(own[there], 2 * rows[of_it[there], weight])
-            found.extend(weights[weights < 301])
-    assert sorted(found) == np.flatnonzero(np.any(rows[:, :300] != 0, axis=0)).tolist()
-    dense = np.ones((MOST_ANSWERS + 1, 40))
-    assert sweep_of(dense, np.eye(40), np.ones((1, 40)), prior_scale=1.0, rank=40) is None
-    assert sweep_of(dense[1:], np.eye(40), np.ones((1, 40)), prior_scale=1.0, rank=40) is not None
+                if weight < len(some):
+                    np.testing.assert_array_equal(of_it[there], np.flatnonzero(rows[:, some[weight]]))
+                    np.testing.assert_array_equal(own[there], 2 * rows[of_it[there], some[weight]])
+            found.extend(some[weights[weights < len(some)]])
+    assert sorted(found) == some[:-1].tolist()
+    path = [np.asarray(block) for blocks in forth_and_back(sweep.blocks) for block in blocks.weights]
+    np.testing.assert_array_equal(path, path[::-1])
+
+
+@pytest.mark.parametrize(
+    ("answers_each", "weights_each", "swept"), [(32, 4, True), (33, 4, False), (32, 5, False), (1, 1, True)]
+)
+def test_sweeps_are_made_where_few_answers_touch_a_weight_and_few_weights_an_answer(answers_each, weights_each, swept):
+    rows = np.kron(np.eye(20), np.ones((answers_each, weights_each)))
+    sweep = sweep_of(rows, np.eye(rows.shape[1]), np.ones((1, len(rows))), prior_scale=1.0, rank=rows.shape[1])
+    assert (sweep is not None) == swept
 
 
 @pytest.mark.parametrize(

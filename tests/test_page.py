@@ -348,6 +348,21 @@ def test_a_page_that_loses_its_program_after_all_answers_says_that_it_can_be_clo
         opened.wait_for_selector(".bp-note", state="hidden")
 
 
+def test_clips_that_a_dead_connection_was_to_bring_are_fetched_again(browser, gridworld):
+    gridworld.session.wait(timeout=60)
+    break_off, back, _ = broken_stream(gridworld)
+    asked = []
+
+    def before(opened):
+        opened.route("**/events", break_off)
+        opened.route("**/clip/**", lambda route: asked.append(route) or (len(asked) > 2 and route.continue_()))
+
+    with tab(browser, gridworld, ready=".bp-note >> text=The connection is lost", before=before) as opened:
+        until(opened, lambda: len(asked) == 2)  # which nobody answers
+        back.set()
+        opened.wait_for_selector(READY, timeout=30_000)
+
+
 def test_views_of_one_turn_wait_for_the_same_clips(browser, gridworld):
     """Each answer of somebody else brings another view; on a slow line the clips then began anew each time."""
     gridworld.session.wait(timeout=60)
@@ -638,6 +653,7 @@ def test_a_browser_that_hangs_up_and_one_that_wants_a_web_socket_leave_no_traceb
         head = f"POST /{gridworld.token}/answer HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 100\r\n\r\n"
         with socket.create_connection(("127.0.0.1", gridworld.port)) as connection:
             connection.sendall(head.encode() + b'{"turn"')
+        time.sleep(0.3)  # until it is noticed
         upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
         status, _ = call(gridworld, "GET", "/events", **upgrade, **{"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="})
         assert status == 403

@@ -1,15 +1,17 @@
-"""Single weights drawn among their steps, block by block, where few answers touch each: items with a feature each.
+"""Single weights drawn among their steps, block by block: for items with a feature each, which few answers touch.
 
 Given all other weights, that of an item is normal times a factor that jumps where a margin of one of its few answers
 changes its sign. If every violated answer had the same price, it would be drawn exactly, and so at once would be the
-weights of a block, of which no two share an answer. The price depends on how many answers are violated, as in
-`refraction`; that present is used for the proposal, and a Metropolis test pays the difference. What else the likelihood
-changes is small, and corrected by a test after a sweep forth and back (surrogate transitions; Liu 2001).
+weights of a block, of which no two share an answer. But the price depends on how many answers are violated, as in
+`refraction`. The proposal is made at the price of the present number, and a Metropolis test pays the difference. What
+else the likelihood changes is small, and corrected by a test after a sweep forth and back (surrogate transitions; Liu
+2001).
 
 A flight changes the number of violated answers by a few, because its energy is conserved. A sweep may change many.
+Where an answer touches many weights hardly any two could be drawn at once, and flights are better.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -19,8 +21,11 @@ from jax import Array, lax, random
 from jax.scipy.special import ndtri
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-# A weight that more answers touch is not drawn here. Where it is too large a part of all, none is.
-MOST_ANSWERS, LEAST_SHARE = 32, 0.9
+from bayespbrl.models.preference_problem import padded_size
+
+# A weight that more answers touch is not drawn here. None is, where these are too large a part of all, or where an
+# answer touches more of the others.
+MOST_ANSWERS, LEAST_SHARE, MOST_WEIGHTS = 32, 0.9, 4
 # Weights of a block: with more, the price changes more between proposal and test.
 BLOCK = 64
 # Blocks are of weights that at most so many answers touch: what touches few is drawn faster.
@@ -33,7 +38,7 @@ class Blocks(NamedTuple):
     """Blocks of one width; padded weights and answers have numbers behind the last.
 
     Attributes:
-      weights: their numbers, block by block.
+      weights: their numbers among those that any answer touches, block by block.
       answers: those that touch each.
       slopes: of the margins of those, by the whitened weight; 0 in padding.
     """
@@ -47,7 +52,7 @@ class Sweep(NamedTuple):
     """What a sweep goes through.
 
     Attributes:
-      basis: Q, with w = Q z + what no answer depends on.
+      basis: Q, with w = Q z + what no answer depends on; of the weights that any answer touches, and padded.
       answerers: who gave each answer, one-hot.
       blocks: of each width.
     """
@@ -68,25 +73,29 @@ def sweep_of(
     prior_scale: float,
     rank: int,
 ) -> Sweep | None:
-    """The sweep of differences, for so many coordinates with padding; None where many answers touch the weights."""
-    touching = [np.flatnonzero(column) for column in differences.T]
-    touched = [np.flatnonzero(row) for row in differences]
-    number = np.array([len(rows) for rows in touching])
-    drawn = np.flatnonzero((number > 0) & (number <= MOST_ANSWERS))
-    if len(drawn) < LEAST_SHARE * np.sum(number > 0) or not len(drawn):
+    """The sweep of differences, for so many coordinates with padding; None where sweeps do not pay."""
+    some = np.any(differences != 0, axis=0)
+    differences, basis = differences[:, some], basis[some]
+    number = np.sum(differences != 0, axis=0)
+    drawn = np.flatnonzero(number <= MOST_ANSWERS)
+    widest = np.max(np.sum(differences[:, drawn] != 0, axis=1), initial=0)
+    if not len(drawn) or len(drawn) < LEAST_SHARE * len(number) or widest > MOST_WEIGHTS:
         return None
+    touching = [np.flatnonzero(column) for column in differences.T]
+    touched = [drawn[np.flatnonzero(row)] for row in differences[:, drawn]]
     group = np.full(len(number), -1)  # no two weights of a group share an answer
     for weight in drawn[np.argsort(-number[drawn], kind="stable")]:
         taken = {group[other] for row in touching[weight] for other in touched[row]}
         group[weight] = next(free for free in range(len(taken) + 1) if free not in taken)
+    size = padded_size(len(number))
     blocks = []
     for least, width in zip((0, *WIDTHS), WIDTHS, strict=False):
-        those = [np.flatnonzero((group == g) & (number > least) & (number <= width)) for g in range(group.max() + 1)]
+        those = [np.flatnonzero((group == g) & (least < number) & (number <= width)) for g in range(group.max() + 1)]
         parts = [them[first : first + BLOCK] for them in those for first in range(0, len(them), BLOCK)]
         if not parts:
             continue
-        shape = (len(parts), BLOCK, width)
-        weights, answers, slopes = np.full(shape[:2], len(number)), np.full(shape, answerers.shape[1]), np.zeros(shape)
+        shape = (len(parts) + len(parts) % 2, BLOCK, width)  # an even number: fewer shapes are fewer compilations
+        weights, answers, slopes = np.full(shape[:2], size), np.full(shape, answerers.shape[1]), np.zeros(shape)
         for block, part in enumerate(parts):
             weights[block, : len(part)] = part
             for place, weight in enumerate(part):
@@ -94,7 +103,7 @@ def sweep_of(
                 answers[block, place, : len(rows)] = rows
                 slopes[block, place, : len(rows)] = prior_scale * differences[rows, weight]
         blocks.append(Blocks(*map(jnp.asarray, (weights, answers, slopes))))
-    wide = np.pad(basis, ((0, 0), (0, rank - basis.shape[1])))
+    wide = np.pad(basis, ((0, size - len(basis)), (0, rank - basis.shape[1])))
     return Sweep(jnp.asarray(wide), jnp.asarray(answerers), tuple(blocks))
 
 
@@ -123,16 +132,16 @@ def sweep_move(
     noise = random.normal(key_rest, (len(basis),), dtype=y.dtype)
     # what no answer depends on keeps its prior, and is drawn anew
     start = basis @ y + noise - basis @ (basis.T @ noise)
-    forth_and_back = [*sweep.blocks, *(Blocks(*(part[::-1] for part in each)) for each in sweep.blocks[::-1])]
+    path = forth_and_back(sweep.blocks)
 
     def next_block(state: _State, now: tuple[PRNGKeyArray, Blocks]) -> tuple[_State, None]:
         key, block = now
         return _block_move(key, state, block, answerers, heights), None
 
     def next_round(before: _State, key: PRNGKeyArray) -> tuple[_State, None]:
-        key_test, *keys = random.split(key, 1 + len(forth_and_back))
+        key_test, *keys = random.split(key, 1 + len(path))
         after = before
-        for key, each in zip(keys, forth_and_back, strict=True):
+        for key, each in zip(keys, path, strict=True):
             after, _ = lax.scan(next_block, after, (random.split(key, len(each.weights)), each))
         # Liu (2001): forth and back, the sweep is reversible for prior × heights
         accepted = jnp.log(random.uniform(key_test, dtype=y.dtype)) < besides(after) - besides(before)
@@ -147,6 +156,11 @@ def sweep_move(
     (weights, *_), _ = lax.scan(next_round, state, random.split(key_rounds, max(1, len(y) // COORDINATES)))
     end = y + basis.T @ (weights - start)
     return end, normals @ end
+
+
+def forth_and_back(blocks: Sequence[Blocks]) -> list[Blocks]:
+    """The blocks, and then the same in the opposite order."""
+    return [*blocks, *(Blocks(*(part[::-1] for part in each)) for each in blocks[::-1])]
 
 
 def _block_move(
@@ -167,7 +181,7 @@ def _block_move(
 
     def priced(violated: Float[Array, " a"]) -> tuple[Float[Array, "s n"], Float[Array, "s m"], Float[Array, " s"]]:
         """The price of an answer by so many violated ones, each interval's share, and the log of the shares' factor."""
-        each = jnp.einsum("a,asn->sn", _at(heights, violated - 1) - _at(heights, violated + 1), whose) / 2
+        each = jnp.einsum("a,asn->sn", _price(heights, violated), whose)
         left = jnp.sum(jnp.where(slopes > 0, each, 0.0), axis=1, keepdims=True)
         passed = jnp.where(slopes > 0, -each, each)[:, :, None]
         passed = jnp.sum(jnp.where(intervals.earlier, passed, 0.0), axis=1)
@@ -238,6 +252,11 @@ def _drawn(key: PRNGKeyArray, intervals: _Intervals, shares: Float[Array, "s m"]
 
 
 def _at(heights: Float[Array, "a v"], violated: Float[Array, " a"]) -> Float[Array, " a"]:
-    """Each answerer's height at so many violated answers, or at the nearest possible number."""
-    number = jnp.clip(violated.astype(int), 0, heights.shape[1] - 1)
-    return heights[jnp.arange(len(heights)), number]
+    """Each answerer's height at so many violated answers."""
+    return heights[jnp.arange(len(heights)), violated.astype(int)]
+
+
+def _price(heights: Float[Array, "a v"], violated: Float[Array, " a"]) -> Float[Array, " a"]:
+    """By how much one violated answer more lowers the height, for each answerer: the mean of the last and the next."""
+    fewer, more = jnp.maximum(violated - 1, 0), jnp.minimum(violated + 1, heights.shape[1] - 1)
+    return (_at(heights, fewer) - _at(heights, more)) / (more - fewer)

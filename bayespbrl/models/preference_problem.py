@@ -167,7 +167,7 @@ def padded_problem(
       rank_at_least: so that problems of different rank can be stacked.
     """
     number, rank = loadings.shape
-    capacity, wide = _capacity(number), _capacity(max(rank, rank_at_least))
+    capacity, wide = padded_size(number), padded_size(max(rank, rank_at_least))
     precisions, used = np.zeros(capacity), np.zeros(capacity, dtype=bool)
     used[:number] = used_rows(loadings)
     precisions[:number] = site_precisions
@@ -187,7 +187,7 @@ def padded_problem(
     )
 
 
-def _capacity(number: int) -> int:
+def padded_size(number: int) -> int:
     """A power of two, at least 32; above 64, where padding costs more than a compilation, in quarter steps.
 
     Up to 32 padding costs nothing: a draw takes as long at 32 as at 8, and less than at 16.

@@ -90,8 +90,7 @@ function back() {
 async function missed() {
   lost ??= performance.now();
   const gone = performance.now() - lost > 1000 * PATIENCE;
-  if (state.view.all_given) fire("msg:custom", { connection: "gone", say: DONE });
-  else fire("msg:custom", gone ? { connection: "gone", say: GONE } : { connection: "lost" });
+  fire("msg:custom", gone ? { connection: "gone", say: state.view.all_given ? DONE : GONE } : { connection: "lost" });
   await pause(gone ? 3000 : 500);
 }
 
@@ -109,6 +108,7 @@ function listen() {
   };
   source.onopen = () => {
     heard();
+    coming = null; // what a dead connection was to bring
     if (lost !== null) back();
   };
   source.onerror = async () => {
