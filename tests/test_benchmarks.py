@@ -176,7 +176,13 @@ def test_a_cell_is_reproduced_and_another_value_is_found():
     assert re.match(r"study smoke, gridworld/\S+, seed \d+, iteration 5: expected value ", later)
     data.description["rounding"] = {"processor": "another"}
     assert page.differences_of_a_cell(data) == []
-    row.lines.loc[row.lines["iteration"] == 1, "value"] += 1.0
+    second = row.lines["iteration"] == 2
+    row.lines.loc[second, "value"] *= 1 + 1e-4  # as rounding makes it
+    assert page.differences_of_a_cell(data) == []
+    row.lines.loc[second, "value"] *= 1.01
+    found, *_ = page.differences_of_a_cell(data)
+    assert re.match(r"study smoke, gridworld/\S+, seed \d+, iteration 2: expected value ", found)
+    row.lines.loc[row.lines["iteration"] == 1, "value"] *= 1 + 1e-4
     first, *_ = page.differences_of_a_cell(data)
     assert re.match(r"study smoke, gridworld/\S+, seed \d+, iteration 1: expected value ", first)
 
