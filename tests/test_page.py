@@ -610,6 +610,7 @@ def test_nonsense_is_refused_and_changes_nothing(gridworld):
         f"/clip/{turn}/2",
         f"/clip/{turn + 1}/0",
         f"/clip/{turn}/x",
+        f"/clip/+{turn}/0",
         f"/clip/{'9' * 5000}/0",
         "/../page.py",
     )

@@ -77,8 +77,7 @@ def step_moves(
     Returns:
       the weights, the unknowns, and whether a flight was given up.
     """
-    key_sweep, key = random.split(key) if steps.sweep is not None else (key, key)
-    keys, y = random.split(key, 3), z / problem.settings.prior_scale
+    y = z / problem.settings.prior_scale
     walls = at_setting(steps.walls, unknowns.setting)
     margins = walls.normals @ y
 
@@ -104,10 +103,11 @@ def step_moves(
         return (y, margins, given_up | this_given_up), None
 
     if steps.sweep is not None:
+        key_sweep, key = random.split(key)
         y, margins = sweep_move(
             key_sweep, y, margins, steps.sweep, normals=walls.normals, heights=steps.heights, log_likelihood=total
         )
-    now = (y, margins, jnp.zeros((), bool))
+    keys, now = random.split(key, 3), (y, margins, jnp.zeros((), bool))
     if steps.ladder is None or steps.sweep is not None:
         now, _ = flight(now, keys[0])
     else:

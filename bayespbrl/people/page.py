@@ -147,10 +147,10 @@ class Page:
 
     async def _clip(self, request: Request) -> Response:
         turn, side = request.path_params["turn"], request.path_params["side"]
-        try:
-            sheet = seat_of(request).sheet(int(turn), ("0", "1").index(side))
-        except ValueError:  # no number, one of too many digits, or of a turn that is over
-            sheet = None
+        sheet = None
+        with contextlib.suppress(ValueError):  # no number, one of too many digits, or of a turn that is over
+            if turn.isascii() and turn.isdecimal():
+                sheet = seat_of(request).sheet(int(turn), ("0", "1").index(side))
         if sheet is None:
             return PlainTextResponse("clip: expected one of the present question", 404)
         kind = "image/png" if sheet.startswith(b"\x89PNG") else "image/jpeg"

@@ -171,7 +171,7 @@ class Session:
                 else:
                     self._take(seat, answer, seconds, replays)
                 self._settle()
-            except KeyboardInterrupt:  # of a notebook's kernel; what is kept by now holds
+            except (KeyboardInterrupt, SystemExit):  # of a notebook's kernel; what is kept by now holds
                 self._foresight.again(self.learner.state)
                 self._settle()
                 raise
