@@ -46,6 +46,7 @@ seed = 1
 report_at = [3]
 [options]
 preset = "paper"
+iterations = 4
 [tasks.gridworld]
 [methods.first]
 [methods.second]
@@ -135,19 +136,28 @@ def test_a_value_after_more_answers_than_were_allowed_is_not_shown(made):
     declared.write_text(DECLARATION.replace("[3]", "[5, 6]"))
     first = values_table(read_study(made)).set_index("methods").loc["first"]
     assert (first["after 5"], first["after 6"]) == ("97.5 [77.75]", "–")
-    declared.write_text(DECLARATION.replace("[3]", "[5, 6]").replace("[methods.first]", "[methods.first]\nanswers = 6"))
+    more = DECLARATION.replace("[methods.first]", "[methods.first]\niterations = 5")
+    declared.write_text(more.replace("[3]", "[5, 6]"))
     first = values_table(read_study(made)).set_index("methods").loc["first"]
     assert first["after 6"] == first["after 5"]  # it might have asked once more
 
 
-def test_the_budget_of_the_default_counts_where_all_trials_of_a_row_ended_before_it(made):
+def test_the_budget_is_what_the_options_allow_where_all_trials_of_a_row_ended_before_it(made):
     without(made, lambda lines: (lines["methods"] == "first") & (lines["iteration"] > 1))
-    cut = values_table(read_study(made)).set_index("methods").loc["second"]
-    assert (cut["at answers"], cut["difference"][:3]) == ("2", "+0 ")  # under the paper's preset, which has none
-    (made / "study.toml").write_text(DECLARATION.replace("paper", "default"))
-    second = values_table(read_study(made)).set_index("methods").loc["second"]
-    assert second["at answers"] == "20"
-    assert second["difference"].startswith("+40 [")  # the last values: of +30, +40, +40, +40
+    for text, answers, difference in [
+        (DECLARATION.replace("[methods.first]", "[methods.first]\niterations = 1"), "2", "+0 "),
+        # with a budget of 20 answers, of which one iteration asks two
+        (
+            DECLARATION.replace("paper", "default").replace("[methods.first]", "[methods.first]\niterations = 1"),
+            "2",
+            "+0 ",
+        ),
+        (DECLARATION, "5", "+40 ["),  # the last values: of +30, +40, +40, +40
+        (DECLARATION.replace("paper", "default").replace("iterations = 4", ""), "20", "+40 ["),
+    ]:
+        (made / "study.toml").write_text(text)
+        second = values_table(read_study(made)).set_index("methods").loc["second"]
+        assert (second["at answers"], second["difference"][: len(difference)]) == (answers, difference)
 
 
 def test_trials_that_are_missing_are_counted_and_never_replaced_by_another_row(made):
@@ -194,8 +204,8 @@ def test_the_page_names_study_command_version_date_and_machine_and_counts_compar
     text = page.read_text()
     for part in ("Study `made`", "bayespbrl study made", "version 0.0", "2026-01-01", "a machine", "one comparison"):
         assert part in text
-    assert "| gridworld | first | preset=paper | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
-    assert "| gridworld | second | preset=paper utility=linear-program | – | – |" in text  # it has no posteriors
+    assert "| gridworld | first | iterations=4 preset=paper | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
+    assert "| gridworld | second | iterations=4 preset=paper utility=linear-program | – | – |" in text  # it has no posteriors
     assert {file.name for file in files} == {"values.csv", "runs.csv", "curves.png", "profiles.png"}
     assert sorted(path.name for path in made.iterdir()) == ["iterations.csv", "study.json", "study.toml"]
 
@@ -223,6 +233,9 @@ def test_kept_policies_stand_beside_the_newest_and_the_best_of_their_runs(made):
     lines.loc[lines["seed"] == 1, "value_newest"] = 11.0
     lines.to_csv(made / "iterations.csv", index=False)
     assert kept_table(read_study(made)).loc[0, "within 3 % of the best"] == "3 of 4"
+    lines.loc[ended & (lines["iteration"] == 4), "value_newest"] = np.nan  # and not the one before it
+    lines.to_csv(made / "iterations.csv", index=False)
+    assert kept_table(read_study(made)).loc[0, ["newest", "best of the run"]].tolist() == ["nan [nan]"] * 2
 
 
 def test_pairs_of_trials_are_counted_by_the_answers_that_they_needed(made):
@@ -237,6 +250,10 @@ def test_pairs_of_trials_are_counted_by_the_answers_that_they_needed(made):
     assert (second["fewer to 50 for good"], second["more to 50 for good"]) == ("1", "3")
     declared.write_text(declared.read_text().replace("good_above = 50", "good_above = 99"))
     assert pairs_table(read_study(made)).loc[0, "median to 99"] == "never against never"
+    declared.write_text(f"{declared.read_text()}\n[tasks.again]\nenv = 'gridworld'\ngood_above = 50")
+    lines = pd.read_csv(made / "iterations.csv")
+    pd.concat([lines, lines.assign(tasks="again")]).to_csv(made / "iterations.csv", index=False)
+    assert pairs_table(read_study(made)).loc[0, "median to 50"] == "–"  # its level is another
 
 
 def test_a_trial_whose_first_policy_comes_late_does_not_delay_the_others_of_its_row(made):
@@ -336,6 +353,13 @@ def test_the_p_value_of_a_paired_comparison_is_that_of_all_signs(number):
         sums = np.array(list(itertools.product((-1, 1), repeat=number))) @ ranks
         expected = np.mean(np.abs(sums) >= abs(np.sign(differences) @ ranks) - 1e-9)
         assert signed_rank_test(differences) == pytest.approx(expected)
+
+
+def test_differences_are_as_large_as_their_digits_say():
+    differences = np.array([1, 1, 1, -1, -1, -1, 2, 2, -2, -2])
+    reference = np.linspace(294.0, 294.9, 10)
+    _, p = paired_difference((reference + differences / 100).round(2), reference.round(2))
+    assert p == signed_rank_test(differences) == 1.0
 
 
 def test_three_unequal_pairs_of_twenty_show_nothing():

@@ -144,6 +144,33 @@ def test_a_damaged_trial_is_given_up_and_the_others_go_on(finished, tmp_path, mo
     assert len(read_study(copy).rows) == 3
 
 
+def test_a_damaged_measurement_is_given_up_and_the_others_go_on(finished, tmp_path, monkeypatch):
+    without_processes(monkeypatch)
+    copy = shutil.copytree(finished, tmp_path / "study")
+    (copy / "gridworld/random/none/seed-2980/first-policy.json").write_text("")
+    study = Study.prepare(parsed(DECLARATION, "tiny"), copy)
+    (failure,) = study.run()
+    assert "random/none seed 2980" in str(failure)
+    assert "first-policy.json: expected value" in str(failure)
+    assert study.finished == 5
+    assert len(read_study(copy).rows) == 3  # as it was measured
+    (copy / "iterations.csv").write_text("")
+    with pytest.raises(ValueError, match=r"iterations\.csv: expected a table, got"):
+        study.write_table()
+
+
+def test_rows_may_be_added(finished, tmp_path, monkeypatch):
+    without_processes(monkeypatch)
+    copy = shutil.copytree(finished, tmp_path / "study")
+    more = DECLARATION.replace("[methods.random]", "[methods.known]\nutility = 'known-reward'\n[methods.random]")
+    study = Study.prepare(parsed(more, "tiny"), copy)
+    assert (study.finished, study.cells) == (6, 10)
+    assert study.run() == []
+    added = "gridworld/known/none", "gridworld/known/mistaken"
+    rows = [row.declared.name for row in read_study(copy).rows]
+    assert sorted(rows) == sorted([row.name for row in parsed(DECLARATION, "tiny").rows] + list(added))
+
+
 def test_a_trial_that_another_program_runs_is_left_to_it(tmp_path):
     row = row_of("gridworld", tmp_path, TINY, seed=2980)
     runs.start("gridworld", row.path(2980), **TINY, seed=2980)
@@ -332,10 +359,21 @@ def test_an_unknown_study_task_or_value_is_one_line(monkeypatch, capsys, tmp_pat
 def test_a_directory_of_something_else_other_settings_or_another_version_is_refused(finished, tmp_path):
     study = parsed(DECLARATION, "tiny")
     copy = shutil.copytree(finished, tmp_path / "study")
-    others = [DECLARATION.replace("iterations = 2", "iterations = 3"), DECLARATION.replace("2980", "2990")]
-    for text in others:
-        with pytest.raises(ValueError, match="as it is declared now, got another"):
+    for text, message in [
+        (
+            DECLARATION.replace("iterations = 2", "iterations = 3"),
+            "got other options for gridworld/linear-program/none",
+        ),
+        (
+            DECLARATION.replace("methods.random", "methods.chance").replace('"random"', '"chance"'),
+            "got none of that name",
+        ),
+        (DECLARATION.replace("2980", "2990"), "expected its seed, 2980, got 2990"),
+    ]:
+        with pytest.raises(ValueError, match=message):
             Study.prepare(parsed(text, "tiny"), copy)
+    with pytest.raises(ValueError, match="expected the study large, got tiny"):
+        Study.prepare(parsed(DECLARATION, "large"), copy)
     description = json.loads((copy / "study.json").read_text())
     (copy / "study.json").write_text(json.dumps(description | {"version": "0.0.1"}))
     with pytest.raises(ValueError, match=r"got one by 0\.0\.1"):
@@ -407,6 +445,13 @@ def test_trials_whose_scheduler_is_lost_are_given_up_whether_cancelled_pending_o
     failures = Engine([seeds], Cancels()).run()
     lost = "the connection to the scheduler is lost"
     assert sorted(map(str, failures)) == [f"row seed {seed}: {lost}" for seed in (4, 5, 6, 7)]
+
+
+@pytest.mark.parametrize(("executor", "running"), [(Cancels(), None), (ThisProcess(), 0)])
+def test_how_many_trials_run_is_not_said_where_the_executor_does_not_tell(tmp_path, executor, running):
+    seeds, seen = Seeds(row_of("gridworld", tmp_path / "row", TINY, seed=6, name="row"), 1), []
+    Engine([seeds], executor, lambda now: seen.append(now.running)).run()
+    assert set(seen) == {running}
 
 
 def test_the_time_left_follows_the_pace_of_this_call():

@@ -32,13 +32,15 @@ def run_study(study: Study, where: int | Executor, command: str) -> list[Failure
         def show(now: Progress) -> None:
             left = "" if now.seconds_left is None else f", about {_time(now.seconds_left)} left"
             elsewhere = f"{now.elsewhere} run by another command, " if now.elsewhere else ""
-            state = f"{now.running} running, {elsewhere}{now.failed} failed{left}"
+            running = "" if now.running is None else f"{now.running} running, "
+            state = f"{running}{elsewhere}{now.failed} failed{left}"
             bar.update(task, completed=now.done, state=state)
 
         try:
             failures = study.run(where, command=command, progress=show)
         except KeyboardInterrupt:
-            console.print("Stopped. Nothing is lost: repeat the command to continue.")
+            there = " Workers finish the trials that they have begun." if isinstance(where, Executor) else ""
+            console.print(f"Stopped. Nothing is lost: repeat the command to continue.{there}")
             raise
     for failure in failures[:MOST_FAILURES]:
         console.print(f"Failed: {failure}")

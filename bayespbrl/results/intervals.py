@@ -54,10 +54,13 @@ def paired_difference(values: np.ndarray, reference: np.ndarray) -> tuple[Interv
     Args:
       values, reference: of the same seeds, shape (S,).
     """
-    differences = np.asarray(values, dtype=np.float64) - np.asarray(reference, dtype=np.float64)
+    values, reference = np.asarray(values, dtype=np.float64), np.asarray(reference, dtype=np.float64)
+    differences = values - reference
     if np.any(np.isnan(differences)):
         return median_interval(differences), np.nan
-    return median_interval(differences), signed_rank_test(differences)
+    # of six digits each: what is less than the last, is rounding, and would tell equal differences apart
+    unit = 1e-9 * max(np.max(np.abs(values)), np.max(np.abs(reference)), np.finfo(float).tiny)
+    return median_interval(differences), signed_rank_test(np.rint(differences / unit))
 
 
 def signed_rank_test(differences: np.ndarray) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bayespbrl import checks
-from bayespbrl.settings.presets import preset_options
+from bayespbrl.settings import settings_for
 from bayespbrl.studies.declaration import AXES, Declaration, DeclaredRow, parsed
 from bayespbrl.studies.study import FIGURES, read_study_json
 from bayespbrl.studies.tables import by_answers
@@ -45,10 +45,8 @@ class RowData:
 
     @property
     def allowed(self) -> int:
-        """The budget of answers: as declared or of the preset, or else the most that a trial used."""
-        options = self.declared.options
-        budget = (preset_options(self.declared.env, options) | dict(options)).get("answers")
-        return max(int(self.used.max()), int(budget or 0))
+        """The budget of answers, by the options; or the most that a trial used, if that is more."""
+        return max(int(self.used.max()), settings_for(self.declared.env, **self.declared.options).most_answers)
 
     def at(self, answers: float) -> np.ndarray | None:
         """Value of each trial after that many answers, or its last where it ended with fewer.

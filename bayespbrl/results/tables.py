@@ -146,7 +146,7 @@ def pairs_table(data: StudyData) -> pd.DataFrame:
             line |= {f"p {name}": f"{sign_test(fewer, more):.2g}"}
         lines.append(line)
     table = pd.DataFrame(lines)
-    return table.reindex(columns=_present(table)) if len(table) else table
+    return table.reindex(columns=_present(table)).fillna(MISSING) if len(table) else table
 
 
 def _answers_above(row: RowData, level: float, *, for_good: bool = False) -> np.ndarray:
@@ -212,8 +212,9 @@ def kept_table(data: StudyData) -> pd.DataFrame:
     for row in data.rows:
         if row.declared.untrained:
             continue
-        trials = row.lines.groupby("seed")["value_newest"]
-        kept, newest, best = row.final, trials.last().to_numpy(), trials.max().to_numpy()
+        trials = [trial["value_newest"].to_numpy() for _, trial in row.lines.groupby("seed")]
+        kept, newest = row.final, np.array([trial[-1] for trial in trials])
+        best = np.array([trial.max() for trial in trials])
         others += int((kept != newest).sum())
         floor = data.floor(row.declared.levels[0])
         close = None if floor is None else best - kept <= CLOSE * np.maximum(best - floor, 0)

@@ -229,6 +229,12 @@ class Settings:
         return max(most, LAST_ITERATIONS) + self._restarted if self._restarted else most + LAST_ITERATIONS
 
     @property
+    def most_answers(self) -> int:
+        """The most answers that a run can use: `answers`, or those of all iterations where they are fewer."""
+        asking = self.questions
+        return asking.within_budget(asking.first_queries + asking.queries_per_iteration * (self.most_iterations - 1), 0)
+
+    @property
     def _restarted(self) -> int:
         """Number of iterations of the restarted policy."""
         return self.update.restart_iterations if self.update.checked and self.iterations is None else 0

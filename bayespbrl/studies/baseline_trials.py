@@ -15,19 +15,17 @@ from bayespbrl.runs.simulated import expert_of
 def measure_baseline(learner: Learner, name: str, directory: Path) -> None:
     """Run a baseline of `BASELINES` on a learner's task, with its expert and seed; in `baseline.json`.
 
-    It gets as many answers as the learner may: `answers`, or those of all iterations. The trial is written when it
+    It gets as many answers as the learner may (`Settings.most_answers`). The trial is written when it
     ends: one that was stopped starts again.
 
     Raises:
       ValueError: a task that the baseline does not take, or an expert who skipped all questions.
     """
     settings = learner.settings
-    asking = settings.questions
-    all_of_them = asking.first_queries + asking.queries_per_iteration * (settings.most_iterations - 1)
     steps = BASELINES[name](
         learner.environment,
         expert_of(learner),
-        answers=all_of_them if asking.answers is None else asking.answers,
+        answers=settings.most_answers,
         seed=settings.seed,
         max_steps=settings.rollouts.max_steps,
     )

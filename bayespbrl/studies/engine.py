@@ -42,7 +42,8 @@ class Progress:
       total: trials of the study, those to come in place of redrawn ones among them.
       before: finished before this call.
       done: finished, `before` among them; redrawn trials do not count.
-      running, elsewhere, failed: trials that run now, that another command runs, or that were given up.
+      running: trials that run now; None on a Dask cluster, whose futures do not tell.
+      elsewhere, failed: trials that another command runs, or that were given up.
       seconds: since the call.
       latest: the trial that was finished last: its row and seed.
     """
@@ -50,7 +51,7 @@ class Progress:
     total: int
     before: int = 0
     done: int = 0
-    running: int = 0
+    running: int | None = 0
     elsewhere: int = 0
     failed: int = 0
     seconds: float = 0.0
@@ -167,15 +168,21 @@ class Engine:
             return
         state = self._state
         state.done, state.failed = self._done(), len(self.failures)
-        state.running, state.elsewhere = sum(future.running() for future in self._running), len(self._elsewhere)
+        state.running = None if _cluster(self.executor) else sum(future.running() for future in self._running)
+        state.elsewhere = len(self._elsewhere)
         state.seconds = time.monotonic() - self._began
         state.latest = None if place is None else (self.rows[place].row, seed)
         self.progress(state)
 
 
+def _cluster(executor: Executor) -> object | None:
+    """Dask's client, which need not be installed; None for another executor."""
+    return getattr(executor, "_client", None)
+
+
 def _lost(executor: Executor) -> bool:
     """Whether Dask's client has given its scheduler up: then its futures are cancelled, or stay pending for ever."""
-    return getattr(getattr(executor, "_client", None), "status", None) in ("closing", "closed")
+    return getattr(_cluster(executor), "status", None) in ("closing", "closed")
 
 
 def _died(error: BaseException) -> bool:

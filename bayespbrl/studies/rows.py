@@ -25,6 +25,8 @@ from bayespbrl.studies.tables import (
     collect_first_policies,
     measure_balancing,
     measure_first_policy,
+    read_balancing,
+    read_first_policy,
 )
 
 # A trial is redrawn if it meets no preference within this many iterations: an early acrobot's trajectories may all time
@@ -88,11 +90,25 @@ class Row:
         if others := self._others(kept.settings, seed):
             raise ValueError(f"{path}: expected a trial with these settings, got others: {', '.join(others)}")
         if self.untrained or self.baseline is not None:
-            return True if (path / (FIRST_POLICY_FILE if self.untrained else BASELINE_FILE)).exists() else None
+            return True if self._measured(path) else None
         if done and self.redraws(len(done), done[-1]["pairs"]):
             return False
-        measured = self.balancing_steps is None or (path / BALANCING_FILE).exists()
-        return True if measured and kept.finished() else None
+        return True if self._measured(path) and kept.finished() else None
+
+    def _measured(self, path: Path) -> bool:
+        """Whether a trial has what is measured apart from the learner's iterations; `DamagedTrial` if unreadable."""
+        file, read = BALANCING_FILE, read_balancing
+        if self.untrained or self.baseline is not None:
+            file, read = (FIRST_POLICY_FILE, read_first_policy) if self.untrained else (BASELINE_FILE, read_baseline)
+        elif self.balancing_steps is None:
+            return True
+        if not (path / file).exists():
+            return False
+        try:
+            read(path)
+        except ValueError as error:
+            raise DamagedTrial(str(error)) from error
+        return True
 
     def _others(self, kept: Settings, seed: int) -> list[str]:
         """What differs in the settings of a trial, but for what is measured: by chance where no seed decides it."""

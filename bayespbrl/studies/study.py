@@ -213,7 +213,11 @@ class Study:
         file = self.directory / name
         text = lines.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         if file.exists():
-            new, kept = (pd.read_csv(source, dtype=str, keep_default_na=False) for source in (StringIO(text), file))
+            new = pd.read_csv(StringIO(text), dtype=str, keep_default_na=False)
+            try:
+                kept = pd.read_csv(file, dtype=str, keep_default_na=False)
+            except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
+                raise ValueError(f"{file}: expected a table, got {checks.reason(error)}") from error
             if list(kept.columns) == list(new.columns):
                 kept = kept[[trial not in read for trial in _trials(kept)]]
                 whole = pd.concat([new, kept])
@@ -277,11 +281,19 @@ def _check_same(declaration: Declaration, directory: Path) -> None:
             f"{directory}: expected a study by version {version('bayespbrl')}, got one by {kept.get('version')}; "
             "choose another --out"
         )
-    before = _settled(parsed((directory / "study.toml").read_text(), declaration.name))
-    if kept.get("study") != declaration.name or before != _settled(declaration):
+    if kept.get("study") != declaration.name:
         raise ValueError(
-            f"{directory}: expected the study {declaration.name} as it is declared now, got another: "
-            f"{kept.get('study')}; choose another --out"
+            f"{directory}: expected the study {declaration.name}, got {kept.get('study')}; choose another --out"
+        )
+    before = parsed((directory / "study.toml").read_text(), declaration.name)
+    if before.seed != declaration.seed:
+        raise ValueError(f"{directory}: expected its seed, {before.seed}, got {declaration.seed}; choose another --out")
+    rows = _settled(declaration)
+    if others := [name for name, settled in _settled(before).items() if rows.get(name) != settled]:
+        what = "other options" if others[0] in rows else "none of that name"
+        raise ValueError(
+            f"{directory}: expected all rows that the study has, as they are there, and perhaps more, got {what} for "
+            f"{others[0]}; choose another --out"
         )
 
 
@@ -300,10 +312,9 @@ def _check_no_more(seeds: Seeds) -> None:
         raise ValueError(f"trials: expected more than {seeds.trials}, of which {row.name} has finished more already")
 
 
-def _settled(declaration: Declaration) -> tuple[Any, ...]:
-    """The parts of a declaration that may not change between two calls."""
-    rows = [(row.levels, row.env, dict(row.options), row.untrained, row.baseline) for row in declaration.rows]
-    return declaration.seed, rows
+def _settled(declaration: Declaration) -> dict[str, tuple[Any, ...]]:
+    """What may not change of a row between two calls, by its name."""
+    return {row.name: (row.env, dict(row.options), row.untrained, row.baseline) for row in declaration.rows}
 
 
 def read_study_json(directory: Path) -> dict[str, Any]:

@@ -43,9 +43,7 @@ def collect(
         if name not in {"iteration", *nested} and (figures := _figures(values)) is not None:
             variables[name] = (("seed", "iteration", f"{name}_dimension")[: figures.ndim], figures)
     if all((Path(path) / BALANCING_FILE).exists() for path in directories):
-        lasted = [
-            _figures_in(Path(path) / BALANCING_FILE, "max_steps", "episodes", "mean_steps") for path in directories
-        ]
+        lasted = [read_balancing(path) for path in directories]
         limits = {name: lasted[0][name] for name in ("max_steps", "episodes")}
         variables["balancing_steps"] = ("seed", np.array([entry["mean_steps"] for entry in lasted]), limits)
     attributes = {"env": summaries[0]["env"], "utility": summaries[0]["utility"]}
@@ -121,6 +119,16 @@ def measure_first_policy(learner: Learner, directory: Path) -> None:
     write_file(directory / FIRST_POLICY_FILE, json.dumps(content, indent=1) + "\n")
 
 
+def read_balancing(directory: Path | str) -> dict[str, float]:
+    """What `measure_balancing` wrote; `ValueError` where it is missing or damaged."""
+    return _figures_in(Path(directory) / BALANCING_FILE, "max_steps", "episodes", "mean_steps")
+
+
+def read_first_policy(directory: Path | str) -> dict[str, float]:
+    """What `measure_first_policy` wrote; `ValueError` where it is missing or damaged."""
+    return _figures_in(Path(directory) / FIRST_POLICY_FILE, "value")
+
+
 def _figures_in(file: Path, *names: str) -> dict[str, float]:
     """The figures of these names in a file; `ValueError` where it has others, or cannot be read."""
     try:
@@ -134,7 +142,7 @@ def _figures_in(file: Path, *names: str) -> dict[str, float]:
 
 def collect_first_policies(directories: Sequence[Path | str], env: str) -> xr.Dataset:
     """The values of first policies as one data set over (seed, iteration), the iteration being 0."""
-    values = [_figures_in(Path(path) / FIRST_POLICY_FILE, "value")["value"] for path in directories]
+    values = [read_first_policy(path)["value"] for path in directories]
     seeds = [int(Path(path).name.rpartition("-")[2]) for path in directories]
     column = np.array(values)[:, None]
     names = {"value": column, "value_newest": column, "answers": np.zeros_like(column, dtype=int)}
