@@ -205,7 +205,9 @@ def test_the_page_names_study_command_version_date_and_machine_and_counts_compar
     for part in ("Study `made`", "bayespbrl study made", "version 0.0", "2026-01-01", "a machine", "one comparison"):
         assert part in text
     assert "| gridworld | first | iterations=4 preset=paper | 16 | 0 | 1.002 | 500 | 0.70 | 0.200 | 0.50 | 2 |" in text
-    assert "| gridworld | second | iterations=4 preset=paper utility=linear-program | – | – |" in text  # it has no posteriors
+    assert (
+        "| gridworld | second | iterations=4 preset=paper utility=linear-program | – | – |" in text
+    )  # it has no posteriors
     assert {file.name for file in files} == {"values.csv", "runs.csv", "curves.png", "profiles.png"}
     assert sorted(path.name for path in made.iterdir()) == ["iterations.csv", "study.json", "study.toml"]
 
