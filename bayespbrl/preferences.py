@@ -6,7 +6,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayespbrl import checks
 from bayespbrl.trajectories import Trajectory
@@ -281,17 +281,21 @@ def pair_differences(
     Raises:
       ValueError: no pairs of integers; a pair with an unknown trajectory, or with the same one twice.
     """
-    numbers = checks.pairs("pairs", pairs)
-    most = len(trajectory_features) - 1
+    numbers = known_pairs("pairs", pairs, len(trajectory_features))
+    return trajectory_features[numbers[:, 0]] - trajectory_features[numbers[:, 1]]  # eq. 5
+
+
+def known_pairs(name: str, pairs: Sequence[tuple[int, int]], known: int) -> Int[np.ndarray, "k 2"]:
+    """`pairs` as an array, where each has two different numbers below `known`; `ValueError` by `name` otherwise."""
+    numbers = checks.pairs(name, pairs)
     for expected, bad in (
-        (f"trajectory numbers in 0 … {most}", np.any((numbers < 0) | (numbers > most), axis=1)),
-        ("two different trajectories in each", numbers[:, 0] == numbers[:, 1]),
+        (f"numbers in 0 … {known - 1}", np.any((numbers < 0) | (numbers >= known), axis=1)),
+        ("two different numbers in each", numbers[:, 0] == numbers[:, 1]),
     ):
         if bad.any():
-            raise ValueError(
-                f"pairs: expected {expected}, got {tuple(numbers[bad][0].tolist())} as number {bad.argmax()}"
-            )
-    return trajectory_features[numbers[:, 0]] - trajectory_features[numbers[:, 1]]  # eq. 5
+            got = tuple(numbers[bad][0].tolist())
+            raise ValueError(f"{name}: expected {expected}, got {got} as number {bad.argmax()}")
+    return numbers
 
 
 def same_starts(trajectories: Sequence[Trajectory]) -> list[list[int]]:

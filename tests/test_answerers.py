@@ -454,6 +454,20 @@ def test_whoever_mostly_tosses_coins_is_to_be_dropped_and_who_often_does_to_be_t
     assert unnamed[1] == "Drop them. run.estimate_without(None) infers the utility without them."
 
 
+def test_a_posterior_of_several_people_without_their_names_tells_nothing_about_one():
+    past = [PastQuestion(n, 0, 1, 1, None, Answer.FIRST, who, None) for n, who in enumerate(("Ada", "Bob", "Ada"), 1)]
+    pairs = [(0, 1), (1, 2), (0, 2)]
+    pooled, first, named = (
+        people(past, infer_utility(np.eye(3), pairs[:number], answerers=names).posterior)["lapse_rate"].values
+        for number, names in ((3, None), (1, None), (3, ["Ada", "Bob", "Ada"]))
+    )
+    assert np.isnan(pooled).all()
+    assert np.isnan(first).tolist() == [False, True]  # before Bob's answer was used
+    assert np.isfinite(named).all()
+    with pytest.raises(ValueError, match="tree: expected a posterior"):
+        people(past, infer_utility(np.eye(3), pairs))
+
+
 def test_whoever_contradicts_themselves_is_asked_again_and_who_cannot_tell_is_shown_more():
     both = [PastQuestion(k, 0, 1, 1, None, Answer.FIRST, "Ada", 5.0) for k in range(4)]
     both += [PastQuestion(9 + k, 1, 0, 1, k, Answer.FIRST, "Ada", 5.0) for k in range(4)]  # the other one, each time

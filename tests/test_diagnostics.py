@@ -27,7 +27,15 @@ def draws():
 
 def test_what_is_no_posterior_is_refused_with_a_word_where_one_is():
     inferred = bayespbrl.infer_utility(np.eye(3), [(0, 1)], steepness=5.0, lapse_rate=0.0)
-    for diagnose in (convergence, diagnostics.influence, diagnostics.sensitivity, diagnostics.predictive_checks):
+    for diagnose in (
+        convergence,
+        diagnostics.influence,
+        diagnostics.sensitivity,
+        diagnostics.predictive_checks,
+        diagnostics.calibration,
+        lambda tree: diagnostics.answer_probabilities(tree, np.eye(3)),
+        lambda tree: diagnostics.plot_ranks(tree, Figure().subplots()),
+    ):
         with pytest.raises(
             ValueError, match=r"tree: expected a posterior, .*, got PosteriorUtility; its .posterior is"
         ):

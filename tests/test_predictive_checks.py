@@ -81,6 +81,12 @@ def test_gains_are_counted_by_what_the_schedule_said():
         gain_calibration(runs, edges=(1, 0))
     with pytest.raises(ValueError, match="runs: expected the iterations of several runs"):
         gain_calibration(runs[0])
+    with pytest.raises(ValueError, match="runs: expected the iterations of several runs"):
+        gain_calibration([7])
+    with pytest.raises(ValueError, match="edges: expected at least two increasing numbers"):
+        gain_calibration(runs, edges=(0, np.nan, 1))
+    with pytest.raises(ValueError, match="statistic: expected one that the runs' schedule reported, got 'nonsense'"):
+        gain_calibration(runs, "nonsense")
     restarted = [
         {"iteration": 1, "value_newest": 5.0},
         {"iteration": 2, "value_newest": 1.0, "schedule": {"agreement": 0.99}, "restarted": 1},  # no update of the last

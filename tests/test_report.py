@@ -607,6 +607,44 @@ def test_a_run_in_progress_is_continued_by_those_who_answered(tmp_path):
     assert text.endswith(f"Continue it with: bayespbrl ask '{tmp_path / 'a run'}' --answerer=Ada")
 
 
+def test_how_a_run_in_progress_is_continued_is_no_command_that_would_be_refused(tmp_path):
+    for name, expert, end in (
+        ("terminal", "terminal", f"bayespbrl resume {tmp_path / 'terminal'} --answerer=Bob"),  # one at a time
+        ("simulated", "return", f"in Python, as it was begun, with bayespbrl.resume('{tmp_path / 'simulated'}')."),
+    ):
+        learner = start(tmp_path / name, expert=expert, iterations=3)
+        for who in ("Ada", "Bob"):
+            learner.ask()
+            learner.tell(["first"], answerer=who)
+        assert report_write._state(read_contents(tmp_path / name)).endswith(end)
+
+
+def test_margins_are_of_the_utility_that_is_acted_on(tmp_path):
+    learner = start(tmp_path / "run", utility="posterior-draw", iterations=3)
+    learner.run(lambda first, second: "first")
+    table = report_tables.answers_table(read_contents(tmp_path / "run"))
+    for row, pair in enumerate(learner.preferences.pairs):
+        preferred, dominated = learner.estimate.trajectory_utilities([learner.state.compared[each] for each in pair])
+        assert float(table["margin"][row]) == pytest.approx(preferred - dominated)
+    assert np.isfinite(table["margin_sd"]).all()
+
+
+def test_pictures_are_not_written_through_a_link(gridworld_copy, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (gridworld_copy / "report_files").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ValueError, match="report_files: expected a folder of the run's own, got a link"):
+        report_write.write_report(gridworld_copy, format="md")
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_an_interval_is_drawn_where_it_is_though_the_utility_lies_outside(drawn):
+    data = {"hidden_return": [0.0, 1.0], "utility": [3.0, -1.0], "lower": [0.0, 0.0], "upper": [2.0, 2.0]}
+    axes = Figure().subplots()
+    report_figures.plot_trajectories(xr.Dataset({name: ("trajectory", each) for name, each in data.items()}), axes)
+    (intervals,) = axes.collections
+    assert [path.vertices[:, 1].tolist() for path in intervals.get_paths()] == [[0.0, 2.0]] * 2
+
+
 @pytest.mark.slow
 def test_what_a_schedule_and_the_choice_of_hyperparameters_reported_is_shown(gridworld_copy):
     rows = [

@@ -5,6 +5,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
+from bayespbrl import infer_utility
 from bayespbrl.diagnostics import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.power_scaling import _quantities
 from bayespbrl.models import sample_posterior
@@ -42,6 +43,12 @@ def test_utility_that_no_answer_constrains_depends_on_the_prior_scale_alone(tree
     assert list(result["diagnosis"].values) == ["prior", "prior"]
     # the unit of a utility does not matter
     np.testing.assert_allclose(*of_component(result, "prior"), rtol=1e-9)
+
+
+def test_the_posterior_of_an_estimate_takes_features_too():
+    utility = infer_utility(np.eye(3), [(0, 1), (1, 2)], steepness=5.0, lapse_rate=0.0)
+    of_items = sensitivity(utility.posterior, np.eye(3) / utility.scales)
+    assert of_items.sizes["quantity"] == 3
 
 
 def test_features_have_no_side():

@@ -220,6 +220,14 @@ def test_a_trial_of_another_task_is_named(study):
         rows.row_of("FrozenLake-v1", study.path, QUICK, seed=5).outcome(5)
 
 
+def test_the_directory_of_a_run_takes_no_trials(study):
+    run = next(study.path.glob("seed-*"))
+    before = sorted(path.name for path in run.iterdir())
+    with pytest.raises(ValueError, match="expected a directory for trials, got a run"):
+        run_trials("gridworld", run, seeds=range(2990, 2991), **QUICK)
+    assert sorted(path.name for path in run.iterdir()) == before
+
+
 def test_a_directory_with_other_settings_is_refused(study):
     wrong = f"expected a trial with these settings, got others: iterations {QUICK['iterations']} instead of 3$"
     with pytest.raises(ValueError, match=wrong):

@@ -83,6 +83,7 @@ def plot_ranks(tree: xr.DataTree, axes: Axes, *, preference: int | None = None, 
 
     Source: Vehtari et al. (2021), section 4.2.
     """
+    check_posterior(tree)
     margins = np.asarray(tree["posterior"]["margins"])
     if not margins.shape[2]:
         raise ValueError("tree: expected a posterior of at least one answer, got none")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+OURS = ("agreement", "signal")  # a run with a constant bound has neither, and no update to show
 EDGES = (0.0, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0)
 
 
@@ -31,14 +32,21 @@ def gain_calibration(
       that was a gain) and its `standard_error`; NaN where a bin is empty.
 
     Raises:
-      ValueError: edges that do not increase; the iterations of one run, not in a list.
+      ValueError: edges that do not increase; the iterations of one run, not in a list; a statistic that no run has.
     """
     bounds = np.asarray(edges, dtype=float)
-    if bounds.ndim != 1 or len(bounds) < 2 or np.any(np.diff(bounds) <= 0):
+    if bounds.ndim != 1 or len(bounds) < 2 or not np.all(np.diff(bounds) > 0):
         raise ValueError(f"edges: expected at least two increasing numbers, got {edges!r}")
-    of_each = [list(summaries) for summaries in runs]
+    expected = "runs: expected the iterations of several runs, a list for each, got something else"
+    try:
+        of_each = [list(summaries) for summaries in runs]
+    except TypeError as error:
+        raise ValueError(expected) from error
     if not all(isinstance(summary, Mapping) for summaries in of_each for summary in summaries):
-        raise ValueError("runs: expected the iterations of several runs, a list for each, got something else")
+        raise ValueError(expected)
+    reported = [summary.get("schedule") or {} for summaries in of_each for summary in summaries]
+    if statistic not in OURS and reported and not any(statistic in each for each in reported):
+        raise ValueError(f"statistic: expected one that the runs' schedule reported, got {statistic!r}")
     pairs = [pair for summaries in of_each for pair in _stated_and_gained(summaries, statistic)]
     stated, gained = np.reshape(np.array(pairs, dtype=float), (-1, 2)).T
     inside = (stated >= bounds[0]) & (stated <= bounds[-1])

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from bayespbrl.models.posterior_tree import check_posterior
 from bayespbrl.preferences import Answer, PastQuestion
 
 LEVEL = 0.9  # of all intervals
@@ -16,7 +17,8 @@ def people(past: Sequence[PastQuestion], posterior: xr.DataTree | None = None) -
 
     Args:
       past: the questions that were answered, `learner.state.past`.
-      posterior: fitted to these answers, `learner.estimate.posterior`; None: without lapse rates and side biases.
+      posterior: fitted to these answers, `learner.estimate.posterior`; None: without lapse rates and side biases, as is
+        one that was fitted to several people's answers without their names.
 
     Returns:
       `answers`, of which `ties`, and `cannot_tell`, which are no answers; `lapse_rate` and `side_bias`, posterior
@@ -30,11 +32,10 @@ def people(past: Sequence[PastQuestion], posterior: xr.DataTree | None = None) -
       statistics between which the median lies with a probability of at least 90 %, NaN with fewer than five times.
     """
     names = list(dict.fromkeys(question.answerer or "" for question in past))
-    # a posterior that knows no names was fitted to one answerer: whoever answered first
-    alone = next((question.answerer or "" for question in past if question.answer is not Answer.SKIP), "")
+    fitted_to = () if posterior is None else _fitted_to(posterior, past)
     pairs = _asked_twice(past)
     rows = [
-        _figures(name, [q for q in past if (q.answerer or "") == name], pairs, _known_to(posterior, name, alone))
+        _figures(name, [q for q in past if (q.answerer or "") == name], pairs, posterior if name in fitted_to else None)
         for name in names
     ]
     columns = rows[0] if rows else _figures("", [], [], None)
@@ -95,13 +96,16 @@ def _around_median(times: Sequence[float]) -> tuple[float, float]:
     return float(ordered[outside - 1]), float(ordered[-outside])
 
 
-def _known_to(posterior: xr.DataTree | None, name: str, alone: str) -> xr.DataTree | None:
-    """The posterior, if it was fitted to answers of this person; else None."""
-    if posterior is None:
-        return None
+def _fitted_to(posterior: xr.DataTree, past: Sequence[PastQuestion]) -> Sequence[str]:
+    """The people of whose answers the posterior says how often they are wrong."""
+    check_posterior(posterior)
     drawn = posterior.children["posterior"].dataset
-    known = drawn["answerer"].values if "answerer" in drawn.coords else [alone]
-    return posterior if name in known else None
+    if "answerer" in drawn.coords:
+        return [str(name) for name in drawn["answerer"].values]
+    given = [question.answerer or "" for question in past if question.answer is not Answer.SKIP]
+    # without names: to whoever answered first, before another did, or to all as if they were one
+    pooled = len(set(given)) > 1 and drawn["margins"].shape[-1] >= len(given)
+    return [] if pooled else given[:1]
 
 
 def _draws(name: str, quantity: str, posterior: xr.DataTree | None) -> np.ndarray:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.models.low_rank import low_rank
-from bayespbrl.models.posterior_tree import bases_of, check_posterior
+from bayespbrl.models.posterior_tree import bases_of, check_posterior, settings_of
 
 COMPONENTS = ("prior", "likelihood")
 # Least standard deviation of a log density over the draws, in nats. Below it powers near 1 have no visible effect, and
@@ -26,7 +26,8 @@ def sensitivity(tree: xr.DataTree, features: np.ndarray | None = None, *, seed: 
 
     Args:
       tree: what `sample_posterior` returned.
-      features: φ(s) of states or feature sums ψ(τ), shape (n, D), in the units of the differences. None: the K margins.
+      features: φ(s) of states or feature sums ψ(τ), shape (n, D), in the units of the differences: of an estimate's
+        posterior divided by its `scales`. None: the K margins.
       seed: of the prior draws in the directions that no answer constrains.
 
     Returns:
@@ -80,11 +81,12 @@ def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) ->
     log_prior = -np.sum(z**2, axis=2) / (2 * scale**2)  # eq. 7
     if features is None:
         return np.asarray(tree["posterior"]["margins"]), log_prior
-    known = np.asarray(tree["constant_data"]["differences"])
-    if known.ndim != 2:
+    settings = settings_of(np.asarray(tree["constant_data"]["differences"]))
+    if len(settings) > 1:
         raise ValueError(
-            f"features: expected None for a posterior over {len(known)} settings, got shape {np.shape(features)}"
+            f"features: expected None for a posterior over {len(settings)} settings, got shape {np.shape(features)}"
         )
+    known = settings[0]
     features = checks.matrix("features", features, columns=known.shape[1])
     (basis,) = bases_of(tree)
     features = np.pad(features, [(0, 0), (0, len(basis) - known.shape[1])])  # no side is in them

@@ -13,7 +13,14 @@ import xarray as xr
 from bayespbrl.models import NOTHING_ELSE, Answers, PreferenceModel, posterior_draws
 from bayespbrl.models.likelihoods import likelihood_of, smoothed_probability
 from bayespbrl.models.posterior import SamplerOptions
-from bayespbrl.models.posterior_tree import answers_of, bases_of, next_lapse_rates, number_of_preferences, settings_of
+from bayespbrl.models.posterior_tree import (
+    answers_of,
+    bases_of,
+    check_posterior,
+    next_lapse_rates,
+    number_of_preferences,
+    settings_of,
+)
 from bayespbrl.utility.posterior_utility import spacing
 
 PREFERRED, DOMINATED, TIED = 0, 1, 2
@@ -54,6 +61,7 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: An
     Raises:
       ValueError: differences of another shape or not finite; sides or answerers that are none.
     """
+    check_posterior(tree)
     fitted = settings_of(np.asarray(tree["constant_data"]["differences"]))
     asked = settings_of(differences)
     if asked.shape[0] != fitted.shape[0] or asked.shape[2] != fitted.shape[2]:

@@ -12,7 +12,7 @@ from scipy.special import xlog1py, xlogy
 from bayespbrl import checks
 from bayespbrl.diagnostics import predictions
 from bayespbrl.models import NOTHING_ELSE, Answers, PreferenceModel
-from bayespbrl.models.posterior_tree import answers_of, number_of_preferences, settings_of
+from bayespbrl.models.posterior_tree import answers_of, check_posterior, number_of_preferences, settings_of
 
 
 def prequential_predictions(
@@ -77,13 +77,15 @@ def calibration(
       predicted: probabilities that the first shown is preferred, shape (K,), as recorded during a run; they need
         `first_preferred`. None: by exact refits, K − 1 of them.
       groups: the number of the answer that each row follows from, shape (K,), never decreasing. The pair that was asked
-        about is the last row of its answer; only that row is scored.
+        about is the last row of its answer; only that row is scored. Every row is an answer of its own by default: not
+        so in a run with ties, after which one answer states several pairs. Its report scores each answer once.
       seed: of drawn orders and of the curve's band.
       sampling_options: `num_samples` and the like of the refits.
 
     Returns:
       what `score_predictions` returns; answers "no difference" are not scored.
     """
+    check_posterior(tree)
     differences = np.asarray(tree["constant_data"]["differences"])
     number, tied = differences.shape[-2], predictions.tied_rows(tree)
     order = "drawn" if first_preferred is None else "given"

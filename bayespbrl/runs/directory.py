@@ -20,7 +20,7 @@ from typing import Any
 from bayespbrl import checks
 from bayespbrl.events import Entry, LearnerState, has_figures, surviving
 from bayespbrl.features import StateFeatures
-from bayespbrl.runs.files import check_file, synchronise, write_file
+from bayespbrl.runs.files import check_file, check_folder, synchronise, write_file
 from bayespbrl.runs.iteration_files import read_iteration, write_iteration
 from bayespbrl.settings import OPTIONS, Settings
 
@@ -328,8 +328,7 @@ def _check_own(path: Path) -> None:
     log, folder = path / "events.jsonl", path / "iterations"
     if log.is_symlink() or (log.exists() and not log.is_file()):
         raise ValueError(f"{log}: expected a file of the run's own, got a link or something that is no file")
-    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise ValueError(f"{folder}: expected a folder of the run's own, got a link or something that is no folder")
+    check_folder(folder)
 
 
 def _read_json(file: Path, expected: str) -> Any:

@@ -57,6 +57,12 @@ def check_file(file: Path) -> None:
         raise ValueError("something that is no file")
 
 
+def check_folder(folder: Path) -> None:
+    """`ValueError` for a link or what is no folder, where files are written; a stranger's run may have one."""
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise ValueError(f"{folder}: expected a folder of the run's own, got a link or something that is no folder")
+
+
 def _drop_stale(directory: Path) -> None:
     """Delete what killed processes left in a directory, where that is possible."""
     with suppress(OSError):

@@ -69,12 +69,14 @@ def run_trials(
       **settings: options of `Settings`.
 
     Raises:
-      ValueError: bad options; a trial in the directory with other settings; a trial that failed, by its seed; too few
-        seeds that meet a preference.
+      ValueError: bad options; the directory of a run; a trial in the directory with other settings; a trial that
+        failed, by its seed; too few seeds that meet a preference.
     """
     if not isinstance(seeds, range) or seeds.step != 1 or not seeds:
         raise ValueError(f"seeds: expected a range of consecutive seeds, at least one, got {seeds!r}")
     checks.seed(seeds[-1])
+    if (Path(directory) / "settings.json").exists():
+        raise ValueError(f"{directory}: expected a directory for trials, got a run; choose another one")
     row = row_of(env, Path(directory), settings, seed=seeds.start, preference_within=preference_within)
     tried = Seeds(row, len(seeds))
 

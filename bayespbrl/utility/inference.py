@@ -12,6 +12,7 @@ from bayespbrl import checks
 from bayespbrl.features import DiffusionBasis, RadialBasis, StateFeatures, checked_features
 from bayespbrl.models import Answers, PreferenceModel, linear_program, plain_chain, plain_draws, posterior_draws
 from bayespbrl.models.posterior_tree import bases_of
+from bayespbrl.preferences import known_pairs
 from bayespbrl.trajectories import DISCOUNT
 from bayespbrl.utility.comparisons import Comparisons, normalised
 from bayespbrl.utility.estimate import UtilityEstimate
@@ -114,7 +115,8 @@ def infer_utility(
       method: `posterior-mean`; `most-likely`; `posterior-draw`, one draw picked by `seed`, with directions that the
         answers do not touch at their mean, zero; or `linear-program`, which leaves ties out.
       discount: γ of ψ, for trajectories that the estimate is asked about later.
-      prior_scale: σ > 0 of the weights.
+      prior_scale: σ > 0 of the weights of features divided by `scales`: then the differences have a root mean square
+        length of 1. Steepness and threshold are in these units too.
       likelihood: `mixed` (eq. 8), `logistic` or `probit`.
       steepness, lapse_rate, tie_threshold: None: inferred, the threshold where there are ties.
       seed: of the sampler.
@@ -132,7 +134,7 @@ def infer_utility(
     sums = checks.matrix("feature_sums", feature_sums)
     if not sums.shape[1]:
         raise ValueError(f"feature_sums: expected shape (n, D >= 1), got {sums.shape}")
-    every = np.concatenate([checks.pairs("pairs", pairs), checks.pairs("ties", ties)])
+    every = np.concatenate([known_pairs("pairs", pairs, len(sums)), known_pairs("ties", ties, len(sums))])
     tied = np.arange(len(every)) >= len(pairs)
     answers = Answers(tied if tied.any() else None, shown_first, answerers).checked(len(every))
     numbers = tuple((first, second) for first, second in every.tolist())

@@ -146,8 +146,8 @@ def plot_trajectories(table: xr.Dataset, axes: Axes) -> Axes:
     """Inferred utility of the compared trajectories, with 90 % intervals, against their hidden return."""
     x, y = table["hidden_return"].values, table["utility"].values
     if "lower" in table:
-        reach = np.abs(np.stack([y - table["lower"].values, table["upper"].values - y]))
-        axes.errorbar(x, y, yerr=reach, fmt="none", ecolor="0.7", elinewidth=1, label="90 % interval")
+        # which a single draw may lie outside of
+        axes.vlines(x, table["lower"].values, table["upper"].values, color="0.7", linewidth=1, label="90 % interval")
     axes.plot(x, y, "o", markersize=4, color=MAIN)
     return finished(axes, whole=False, xlabel="hidden return (the learner never sees it)", ylabel="inferred utility")
 

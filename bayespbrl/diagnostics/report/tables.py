@@ -100,16 +100,17 @@ def _by_last_estimate(
     estimate, tree = contents.estimate, contents.posterior
     if estimate is None or answer.row is None or answer.row >= estimate.quality.pairs:
         return np.nan, np.nan, np.nan
-    both = _preferred_and_dominated(contents, answer)
-    if tree is not None and margins is not None:
-        margin = margins[:, :, answer.row]
-        probability = np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row]))
-    elif both is None:
-        return np.nan, np.nan, np.nan
-    else:
+    used, both = np.nan, _preferred_and_dominated(contents, answer)
+    if both is not None:
         preferred, dominated = estimate.trajectory_utilities(both)
-        return np.nan, float(preferred - dominated), np.nan
-    return float(probability), float(margin.mean()), float(margin.std())
+        used = float(preferred - dominated)
+    if tree is None or margins is None:
+        return np.nan, used, np.nan
+    margin = margins[:, :, answer.row]
+    probability = np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row]))
+    if contents.settings.estimation.utility == "posterior-mean":  # also without the trajectories or their features
+        used = float(margin.mean())
+    return float(probability), used, float(margin.std())
 
 
 def prequential_table(contents: RunContents) -> xr.Dataset:

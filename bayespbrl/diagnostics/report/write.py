@@ -19,9 +19,10 @@ from bayespbrl.diagnostics.report.document import Body, Comparison, Picture, Rep
 from bayespbrl.diagnostics.report.people import has_people, people_section
 from bayespbrl.diagnostics.report.summary import summary
 from bayespbrl.diagnostics.report.warnings import find_warnings
+from bayespbrl.experts import SIMULATED
 from bayespbrl.features import StateFeatures
 from bayespbrl.runs.directory import command_to_continue
-from bayespbrl.runs.files import write_file
+from bayespbrl.runs.files import check_folder, write_file
 
 
 def write_report(
@@ -53,6 +54,7 @@ def write_report(
     path = Path(directory) / f"report.{format}"
     try:
         if format == "md":
+            check_folder(Path(directory) / "report_files")
             _write_pictures(Path(directory) / "report_files", report)
         write_file(path, _rendered(report, format))
     except OSError as error:
@@ -128,7 +130,12 @@ def _state(contents: RunContents) -> str:
     if contents.settings.own_parts:
         return text + f"Continue it in Python with bayespbrl.resume({str(contents.path)!r}) and your own objects."
     people = [name for name in contents.preferences.answerers if name is not None]
-    command = "ask" if contents.settings.expert == "page" else "resume"
+    expert = contents.settings.expert
+    if expert in SIMULATED and people:  # the command would let the simulated expert answer the rest
+        return text + f"Continue it in Python, as it was begun, with bayespbrl.resume({str(contents.path)!r})."
+    if expert == "terminal":
+        people = people[-1:]  # one at a time
+    command = "ask" if expert == "page" else "resume"
     return text + f"Continue it with: {command_to_continue(command, contents.settings, contents.path, people)}"
 
 
