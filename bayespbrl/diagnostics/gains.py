@@ -40,8 +40,8 @@ def gain_calibration(
     expected = "runs: expected the iterations of several runs, a list for each, got something else"
     try:
         of_each = [list(summaries) for summaries in runs]
-    except TypeError as error:
-        raise ValueError(expected) from error
+    except TypeError as reason:
+        raise ValueError(expected) from reason
     if not all(isinstance(summary, Mapping) for summaries in of_each for summary in summaries):
         raise ValueError(expected)
     reported = [summary.get("schedule") or {} for summaries in of_each for summary in summaries]
