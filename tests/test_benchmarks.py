@@ -367,3 +367,16 @@ def test_an_earlier_version_is_compared_pair_by_pair_with_the_policies_that_the_
     assert table["default − earlier"].str.startswith("1.5 [1.5, ").all()
     assert table["earlier"].str.endswith(", 1 fail").all()
     assert table["default"].str.startswith(f"{np.median(kept):.4g} [").all()
+
+
+@pytest.mark.slow
+def test_kept_policies_are_compared_with_the_best_by_other_episodes(printed, tmp_path):
+    options = QUICK | {"preset": "default", "utility": "posterior-mean", "checked": True, "iterations": 3}
+    bayespbrl.start("gridworld", tmp_path / "row" / "seed-5", **options | {"seed": 5}).run(bayespbrl.ReturnExpert())
+    lines = printed("kept_policies", tmp_path / "row", "--out", tmp_path / "kept.csv", "--episodes", "20")
+    (row,) = pd.read_csv(tmp_path / "kept.csv").to_dict("records")
+    run = bayespbrl.load(tmp_path / "row" / "seed-5")
+    assert (row["seed"], row["policies"], row["kept"]) == (5, 3, run.iterations[-1]["kept"])
+    assert row["seemed best"] == pytest.approx(max(each["value_newest"] for each in run.iterations), abs=1e-4)
+    assert row["value best"] > row["value first"]
+    assert any(line.startswith("fresh episodes: close in") for line in lines)

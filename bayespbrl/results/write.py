@@ -45,7 +45,8 @@ NOTES = {
     "Hochberg (false discovery). Brackets elsewhere: 95 % intervals, bootstrap over trials, of failed trials exact "
     "(Clopper and Pearson).",
     "kept": "value, median [lower quartile], of the policy that a run keeps, of its newest, and of the best of the "
-    "run, which only the hidden reward knows. Within 3 % of the best: of what that gains over the random policy.",
+    "run, which only the hidden reward knows. Within 3 % of the best: of what that gains over the random policy. "
+    "The highest of some thirty evaluations is also the luckiest, so where episodes differ this counts too few.",
     "pairs": "pairs of the same seed: in how many the trial needed fewer answers than the one it is compared with, and "
     "more; in all, until its kept policy is better than the value, and until it stays so. p: two-sided sign tests, not "
     "adjusted for their number.",
