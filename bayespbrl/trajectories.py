@@ -112,9 +112,20 @@ def transitions(trajectories: Sequence[Trajectory]) -> Transitions:
     )
 
 
+Features = Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
+
+
+def step_features(
+    features: Features, next_states: Shaped[np.ndarray, "n ..."], actions: Shaped[np.ndarray, "n ..."]
+) -> Shaped[np.ndarray, "n d"]:
+    """φ of n steps: of the next state, and of the action where φ has a feature of it (`of_steps`)."""
+    of_steps = getattr(features, "of_steps", None)
+    return features(next_states) if of_steps is None else of_steps(next_states, actions)
+
+
 def trajectory_features(
     trajectories: Sequence[Trajectory],
-    features: Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]],
+    features: Features,
     *,
     discount: float,
 ) -> Float[np.ndarray, "m d"]:
@@ -125,12 +136,15 @@ def trajectory_features(
 
     Args:
       trajectories: of any lengths.
-      features: φ(s).
+      features: φ(s), or that of steps (`step_features`).
       discount: γ in [0, 1].
     """
     if not trajectories:
         raise ValueError("trajectory_features: expected at least one trajectory, got none")
-    table = features(np.concatenate([t.states[1:] for t in trajectories]))
+    states, actions = (
+        np.concatenate(part) for part in zip(*((t.states[1:], t.actions) for t in trajectories), strict=True)
+    )
+    table = step_features(features, states, actions)
     discounts = np.concatenate([discount ** np.arange(len(t)) for t in trajectories])
     starts = np.cumsum([0] + [len(t) for t in trajectories[:-1]])
     return np.add.reduceat(table * discounts[:, None], starts, axis=0)  # eq. 1

@@ -154,12 +154,16 @@ def posterior_ppo_cell(cell: Cell, directory: Path) -> dict[str, float]:
         def reset(self) -> Any:
             return self.venv.reset()
 
+        def step_async(self, actions: np.ndarray) -> None:
+            self.taken = np.array(actions, float)
+            self.venv.step_async(actions)
+
         def step_wait(self) -> Any:
             observations, _, done, infos = self.venv.step_wait()
             reached = np.array(observations, float)
             for copy in np.flatnonzero(done):
                 reached[copy] = infos[copy]["terminal_observation"]
-            return observations, run.estimate.utilities(reached), done, infos
+            return observations, run.estimate.utilities(reached, actions=self.taken), done, infos
 
     began = time.process_time()
     copies = DummyVecEnv([lambda: Counted(gymnasium.make(cell.task), count) for _ in range(COPIES)])

@@ -22,6 +22,7 @@ from bayespbrl.features import (
     draw_state_action_features,
     draw_state_features,
 )
+from bayespbrl.features.drawn import EFFORT
 from bayespbrl.kernels import ROWS_AT_A_TIME, median_bandwidths, radial_basis_row
 from bayespbrl.trajectories import Trajectory, trajectory_features
 from bayespbrl.utility import infer_utility
@@ -168,6 +169,28 @@ def test_a_constant_feature_has_the_variance_of_the_others_where_lengths_differ(
     assert np.mean(utility.trajectory_draws([longer, shorter]) @ [1, -1] > 0) > 0.95
 
 
+def test_effort_is_the_mean_square_of_an_action_in_shares_of_the_largest():
+    rng = np.random.default_rng(1)
+    source = FeatureSource(STATES, Box(np.array([-2.0, 0.0, -np.inf]), np.array([1.0, 4.0, np.inf]), dtype=np.float64))
+    actions = np.array([[-2.0, 2.0, 3.0], [1.0, 4.0, -3.0]])
+    walk = Trajectory(rng.normal(size=(3, 2)), actions, np.zeros(2))
+    features = source.of_states([walk], RadialBasisOptions(8, effort=True), rng=rng)
+    columns = features.of_steps(walk.states[1:], actions)
+    raw = np.array([(1 + 0.25 + 1) / 3, (0.25 + 1 + 1) / 3])
+    np.testing.assert_allclose(columns[:, -1] / columns[0, -1], raw / raw[0])
+    states = np.mean(np.sum(features(features.centres) ** 2, axis=1))
+    np.testing.assert_allclose(np.mean(columns[:, -1] ** 2), EFFORT * states)  # of the prior variance
+    np.testing.assert_array_equal(features(walk.states[1:])[:, -1], 0)  # of a state alone
+    np.testing.assert_array_equal(columns[:, :-1], features(walk.states[1:])[:, :-1])
+    assert not source.of_states([walk], RadialBasisOptions(8), rng=rng).effort
+    still = Trajectory(walk.states, np.zeros((2, 3)), np.zeros(2))
+    assert not source.of_states([still], RadialBasisOptions(8, effort=True), rng=rng).effort
+    discrete = Trajectory(walk.states, np.zeros(2, int), np.zeros(2))
+    assert (
+        not FeatureSource(STATES, Discrete(2)).of_states([discrete], RadialBasisOptions(8, effort=True), rng=rng).effort
+    )
+
+
 def test_the_traceable_row_equals_the_matrix():
     rng = np.random.default_rng(2)
     points, centres, bandwidths = swinging_states(30, rng), swinging_states(11, rng), np.array([0.7, 0.0])
@@ -311,7 +334,7 @@ def test_features_are_dataclasses_of_arrays_and_numbers(observation_space, actio
             for field in fields(value):
                 check(getattr(value, field.name))
         else:
-            assert isinstance(value, np.ndarray | int | float)
+            assert isinstance(value, np.ndarray | int | float | tuple)
 
     check(features)
 
@@ -376,24 +399,33 @@ def test_bad_input_is_named(call, message):
         call(np.random.default_rng(0))
 
 
-@pytest.mark.parametrize(("normalised", "constant"), [(False, 0.0), (True, 0.0), (True, 0.3)])
+@pytest.mark.parametrize(
+    ("normalised", "constant", "effort"),
+    [(False, 0.0, ()), (True, 0.0, ()), (True, 0.3, ()), (True, 0.0, (0.2,)), (True, 0.3, (0.2,))],
+)
 @pytest.mark.parametrize("dimensions", [1, 3, 5])
-def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, constant, dimensions):
+def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, constant, effort, dimensions):
     rng = np.random.default_rng(dimensions)
     period, bandwidths = np.full(dimensions, np.inf), rng.uniform(0.3, 2.0, dimensions)
     period[dimensions // 2], bandwidths[-1] = 2.0, 0.0  # one dimension is a circle, one is left out
     bandwidths[0] = 0.7
-    features = RadialBasis(rng.normal(size=(20, dimensions)), bandwidths, period, normalised, constant)
+    features = RadialBasis(rng.normal(size=(20, dimensions)), bandwidths, period, normalised, constant, effort)
     states = rng.normal(size=(300, dimensions))
     states[:2] *= 1e4  # far from all centres, where every exponential is zero
     multiples = bandwidth_multiples(features, inferred=True, rng=rng)
-    weights = [rng.normal(size=(20 + (constant > 0), 1 + number % 3)) for number in range(len(multiples))]
+    number_of_features = 20 + (constant > 0) + len(effort)
+    weights = [rng.normal(size=(number_of_features, 1 + number % 3)) for number in range(len(multiples))]
+    actions = rng.normal(size=(299, 1))
     values = values_under(features, multiples, states, weights)
-    path = Trajectory(states, np.zeros((299, 1)), np.zeros(299), False)
+    of_steps = values_under(features, multiples, states[1:], weights, actions=actions)
+    path = Trajectory(states, actions, np.zeros(299), False)
     sums = sums_under(features, multiples, [path, path], discount=0.9)
-    for row, columns, value, total in zip(multiples, weights, values, sums, strict=True):
+    for row, columns, value, of_step, total in zip(multiples, weights, values, of_steps, sums, strict=True):
         alone = features.rescaled(row)
         np.testing.assert_allclose(value, alone(states) @ columns, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(of_step, alone.of_steps(states[1:], actions) @ columns, rtol=1e-9, atol=1e-11)
+        (single,) = values_under(features, row[None], states[1:], [columns], actions=actions)
+        np.testing.assert_allclose(single, of_step, rtol=1e-9, atol=1e-11)
         expected = trajectory_features([path, path], alone, discount=0.9)
         np.testing.assert_allclose(total, expected, rtol=1e-9, atol=1e-11)
 

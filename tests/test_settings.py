@@ -65,6 +65,7 @@ BAD = {
     "checked": [None, 1, "yes"],
     "check_episodes": [None, 1, 2.5, True],
     "restart_iterations": [None, -1, 2.5, True],
+    "effort_utility": [None, 1, "yes"],
     "critic_iterations": [0, -4, True, 2.0],
 }
 

@@ -454,6 +454,33 @@ def test_an_unknown_method_is_refused():
         inference.infer_utility(np.eye(3), [(1, 0)], method="median")
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("bandwidth", [1.0, 0.0])
+def test_answers_that_only_effort_explains_are_explained_by_it(method, bandwidth):
+    """Random walks, of which the one with less effort is preferred; without states that tell anything if 0."""
+    rng = np.random.default_rng(2)
+    walks = [
+        Trajectory(rng.normal(size=(21, 2)), rng.uniform(-1, 1, size=(20, 1)) * rng.uniform(0.2, 1), np.zeros(20))
+        for _ in range(24)
+    ]
+    efforts = np.array([np.sum(walk.actions**2) for walk in walks])
+    pairs = [
+        (i, j) if efforts[i] < efforts[j] else (j, i) for i, j in zip(range(0, 16, 2), range(1, 16, 2), strict=True)
+    ]
+    features = RadialBasis(rng.normal(size=(6, 2)), np.full(2, bandwidth), np.full(2, np.inf), True, 0.0, (1.0,))
+    estimate = estimate_utility(walks, pairs, features, method=method, discount=1.0)
+    utilities = estimate.trajectory_utilities(walks)
+    if method != "linear-program" or not bandwidth:  # whose weights are bounded
+        assert estimate.quality.pairs_satisfied == len(pairs)
+    if method == "posterior-mean":
+        assert np.corrcoef(utilities[16:], -efforts[16:])[0, 1] > 0.6  # of walks that nobody judged
+    steps = transitions(walks[:1])
+    assert np.sum(estimate.step_utilities(steps)) == pytest.approx(utilities[0])
+    # a state alone is worth what a step there without any effort is
+    still = estimate.utilities(steps.next_states, actions=np.zeros((20, 1)))
+    np.testing.assert_allclose(estimate.utilities(steps.next_states), still)
+
+
 def test_twenty_answers_find_the_one_of_eight_dimensions_that_matters():
     rng = np.random.default_rng(5)
     walks = np.cumsum(rng.normal(size=(70, 26, 8)), axis=1) + 3 * rng.normal(size=(70, 1, 8))

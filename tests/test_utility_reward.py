@@ -43,6 +43,25 @@ def test_a_step_earns_the_utility_of_the_next_state_and_tells_the_true_reward(pe
         assert info["utility_deviation"] == pytest.approx(few.std(), rel=1e-5)
 
 
+@pytest.mark.parametrize("utility", ["posterior-mean", "linear-program"])
+def test_a_step_earns_the_utility_of_its_effort_too(tmp_path, utility):
+    run = run_of("Pendulum-v1", tmp_path / "run", effort_utility=True, utility=utility)
+    assert len(run.estimate.features.effort) == 1
+    wrapped = UtilityReward(gymnasium.make("Pendulum-v1"), run)
+    for action in (0.0, 1.5, 7.0):
+        wrapped.reset(seed=5)
+        observation, reward, *_ = wrapped.step(np.array([action], np.float32))
+        taken = np.array([[min(action, 2.0)]])  # as the environment takes it
+        states = observation[None].astype(float)
+        assert reward == pytest.approx(run.estimate.utilities(states, actions=taken)[0])
+        part = run.estimate.features.efforts(taken) * run.estimate.weights[..., -1].sum()
+        assert reward == pytest.approx(run.estimate.utilities(states)[0] + part[0])
+    learner = bayespbrl.resume(tmp_path / "run")
+    assert learner.estimate.features.effort == run.estimate.features.effort
+    told = "weight of the effort of actions, in prior standard deviations: " in run.report("md").read_text()
+    assert told == (utility == "posterior-mean")
+
+
 def test_caution_subtracts_standard_deviations(pendulum):
     careless, careful = (UtilityReward(gymnasium.make("Pendulum-v1"), pendulum, caution=c) for c in (0.0, 2.0))
     careless.reset(seed=5)

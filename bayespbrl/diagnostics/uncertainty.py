@@ -114,7 +114,7 @@ def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: 
     if states.ndim == 0 or actions.ndim == 0 or not (len(states) and len(actions)):
         raise ValueError(f"states, actions: expected at least one row each, got {states.shape} and {actions.shape}")
     steps = transitions(learner.trajectories)
-    _, draws = fit.utilities_and_draws(steps.next_states, number=number)
+    _, draws = fit.utilities_and_draws(steps.next_states, number=number, actions=steps.actions)
     q = estimate_q(
         learner.state.kept_policy,
         CriticData(steps, draws.T),

@@ -18,6 +18,7 @@ from bayespbrl.features.radial import JointRadialBasis, RadialBasis, RadialBasis
 from bayespbrl.trajectories import Trajectory, Transitions
 
 ACTION_BANDWIDTH = 0.5  # of the action kernel, as a fraction of the action's range
+EFFORT = 0.1  # prior variance of an observed action's effort in the utility, in that of the functions of a state
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +51,7 @@ def draw_state_features(
     kernel = options.state_kernel(states, rng)[0]
     if not options.constant:
         return kernel
-    variances = np.sum(kernel(kernel.centres) ** 2, axis=1)  # the centres are a sample of the states
-    return replace(kernel, constant=float(np.sqrt(np.mean(variances))))
+    return replace(kernel, constant=float(np.sqrt(_variance(kernel))))
 
 
 def draw_state_action_features(
@@ -128,7 +128,12 @@ class FeatureSource:
         if len({len(each) for each in trajectories}) == 1 and not any(each.terminated for each in trajectories):
             options = replace(options, constant=False)
         observed = np.concatenate([trajectory.states for trajectory in trajectories])
-        return draw_state_features(self.observation_space, observed, self._periodic(options), rng=rng)
+        drawn = draw_state_features(self.observation_space, observed, self._periodic(options), rng=rng)
+        if not (options.effort and isinstance(drawn, RadialBasis) and isinstance(self.action_space, Box)):
+            return drawn
+        return replace(
+            drawn, effort=_effort(drawn, self.action_space, np.concatenate([t.actions for t in trajectories]))
+        )
 
     def of_steps(
         self, steps: Transitions, options: RadialBasisOptions, *, rng: np.random.Generator
@@ -139,6 +144,22 @@ class FeatureSource:
 
     def _periodic(self, options: RadialBasisOptions) -> RadialBasisOptions:
         return replace(options, period=self.period)
+
+
+def _effort(drawn: RadialBasis, space: Box, actions: Float[np.ndarray, "n a"]) -> tuple[float, ...]:
+    """The factors of the squares of an action's parts, as `RadialBasis` has them; () where all actions are 0."""
+    largest = np.maximum(np.abs(space.low), np.abs(space.high)).astype(np.float64)
+    usual = np.sqrt(np.mean(actions**2, axis=0))
+    unit = np.where(np.isfinite(largest), largest, usual)
+    shares = 1 / (len(unit) * np.where(unit > 0, unit, 1.0) ** 2)
+    observed = np.sqrt(np.mean((actions**2 @ shares) ** 2))
+    return tuple((np.sqrt(EFFORT * _variance(drawn)) / observed * shares).tolist()) if observed > 0 else ()
+
+
+def _variance(drawn: RadialBasis) -> float:
+    """Prior variance of a state's utility by the functions alone, in the mean over the centres, which are states."""
+    columns = drawn(drawn.centres)[:, : len(drawn.centres)]
+    return float(np.mean(np.sum(columns**2, axis=1)))
 
 
 def _box(name: str, space: Space[Any]) -> Box:

@@ -21,7 +21,9 @@ class RadialBasis:
       period: infinite where not periodic.
       normalised: whether φ is divided by its sum. A linear function of it then keeps the value of the nearest centres
         beyond them, where plain radial basis functions fall to zero.
-      constant: value of one more feature, the last, which is the same for all states; 0: there is none.
+      constant: value of one more feature, which is the same for all states; 0: there is none.
+      effort: what the squares of an action's parts are multiplied with in one more feature of a step, the last; it is 0
+        for a state alone; (): there is none.
     """
 
     centres: Float[np.ndarray, "d s"]
@@ -29,12 +31,26 @@ class RadialBasis:
     period: Float[np.ndarray, " s"]
     normalised: bool = False
     constant: float = 0.0
+    effort: tuple[float, ...] = ()
 
     def __call__(self, observations: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Features of N observations, shape (N, S)."""
         observations = matrix("observations", observations, columns=self.centres.shape[1])
         basis = radial_basis(observations, self.centres, self.bandwidths, self.period, normalised=self.normalised)
-        return np.pad(basis, ((0, 0), (0, 1)), constant_values=self.constant) if self.constant else basis
+        if self.constant:
+            basis = np.pad(basis, ((0, 0), (0, 1)), constant_values=self.constant)
+        return np.pad(basis, ((0, 0), (0, 1))) if self.effort else basis
+
+    def of_steps(self, next_states: ArrayLike, actions: ArrayLike) -> Float[np.ndarray, "n d"]:
+        """Features of N steps: of the next states, and of the effort of the actions where that is one."""
+        values = self(next_states)
+        if self.effort:
+            values[:, -1] = self.efforts(actions)
+        return values
+
+    def efforts(self, actions: ArrayLike) -> Float[np.ndarray, " n"]:
+        """The feature of the effort of N actions, shape (N, A)."""
+        return np.square(matrix("actions", actions, columns=len(self.effort))) @ np.array(self.effort)
 
     def rescaled(self, multiples: ArrayLike) -> Self:
         """The same centres with bandwidths `multiples` times as wide, one number or one per dimension."""
@@ -45,7 +61,7 @@ class RadialBasis:
     ) -> Iterator[tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]]:
         """`rescaled(row)(observations)` for each row of `multiples` in turn, as in `radial_basis_under`.
 
-        The constant feature is not among them.
+        Neither the constant feature nor that of the effort is among them.
         """
         points = matrix("observations", observations, columns=self.centres.shape[1])
         return radial_basis_under(
@@ -101,6 +117,9 @@ class RadialBasisOptions:
       normalised: as in `RadialBasis`; for φ(s) alone.
       constant: whether φ(s) has a constant feature too, which gives the utility of a state as much prior variance as
         the others give it in the mean. Then how long a trajectory is counts by itself.
+      effort: whether φ of a step has one more feature: the mean square of the action's parts, as shares of the largest
+        that the space allows, or where it has no bound of their root mean square. An observed one then has a tenth of
+        the prior variance that the functions give a state. Only where actions are continuous.
       diffusion: whether φ(s) of discrete states is a `DiffusionBasis` of the observed steps instead of one-hot.
       standardised: whether the one-hot φ(s) of discrete states is divided by how much the number of their visits varies
         between trajectories.
@@ -111,6 +130,7 @@ class RadialBasisOptions:
     period: ArrayLike | None = None
     normalised: bool = False
     constant: bool = False
+    effort: bool = False
     diffusion: bool = False
     standardised: bool = False
 

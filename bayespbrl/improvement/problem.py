@@ -131,12 +131,12 @@ def step_utilities(
     """uᵢ of each transition, and under S posterior draws: at most `draws`, None where there are none."""
     if not draws or utility.posterior is None:
         return utility.step_utilities(steps), None
-    states = steps.next_states
-    rows: slice | Int[np.ndarray, " n"] = slice(None)
-    if states.ndim == 1:  # discrete: each is evaluated once
-        states, rows = np.unique(states, return_inverse=True)
-    utilities, drawn = utility.utilities_and_draws(states, number=draws)
-    return utilities[rows], drawn[:, rows].T
+    if steps.next_states.ndim == 1:  # discrete: each is evaluated once
+        states, rows = np.unique(steps.next_states, return_inverse=True)
+        utilities, drawn = utility.utilities_and_draws(states, number=draws)
+        return utilities[rows], drawn[:, rows].T
+    utilities, drawn = utility.utilities_and_draws(steps.next_states, number=draws, actions=steps.actions)
+    return utilities, drawn.T
 
 
 def recent(trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iteration: int) -> Sequence[Trajectory]:

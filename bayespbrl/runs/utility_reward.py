@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 
 from bayespbrl import checks
 from bayespbrl.envs.spaces import spaces_of, to_plain
@@ -13,7 +14,7 @@ DRAWS = 200  # for the standard deviation: known to a twentieth
 
 
 class UtilityReward(gymnasium.Wrapper):
-    """`env` with the inferred utility of the next state as its reward.
+    """`env` with the inferred utility of the next state, and of the action's effort if it counts, as its reward.
 
     `info` of each step has `true_reward`, the environment's own, and `utility_deviation`, the posterior standard
     deviation of the utility there. A policy that learns from this reward tells whether the utility or the policy of a
@@ -53,14 +54,17 @@ class UtilityReward(gymnasium.Wrapper):
         """A step of the environment, with the utility as the reward."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         utility, deviation = self._utility(
-            np.asarray(to_plain(self.env.observation_space, observation, self.env.action_space))[None]
+            np.asarray(to_plain(self.env.observation_space, observation, self.env.action_space))[None], action
         )
         info = info | {"true_reward": float(reward), "utility_deviation": deviation}
         return observation, utility - self.caution * deviation, terminated, truncated, info
 
-    def _utility(self, states: np.ndarray) -> tuple[float, float]:
+    def _utility(self, states: np.ndarray, action: Any) -> tuple[float, float]:
         states = states.astype(np.float64) if states.ndim > 1 else states  # as the learner saw them
+        space, taken = self.env.action_space, None
+        if isinstance(space, Box):
+            taken = np.clip(np.asarray(action, dtype=np.float64), space.low, space.high).reshape(1, -1)
         if self._thinned.posterior is None:
-            return float(self._thinned.utilities(states)[0]), 0.0
-        mean, draws = self._thinned.utilities_and_draws(states)
+            return float(self._thinned.utilities(states, actions=taken)[0]), 0.0
+        mean, draws = self._thinned.utilities_and_draws(states, actions=taken)
         return float(mean[0]), float(draws[:, 0].std())

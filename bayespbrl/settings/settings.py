@@ -47,6 +47,7 @@ class Features:
         that the utility extends to states far from every compared trajectory, where plain ones fall to zero.
       constant_utility: whether the utility has a constant part, as in `RadialBasisOptions`, where some episodes end
         before the time limit.
+      effort_utility: whether the utility has a part for the effort of continuous actions, as in `RadialBasisOptions`.
       diffusion_utility: whether the utility of discrete states is smooth over the steps that were observed, with a
         length scale that is inferred, as in `DiffusionBasis`; else it has an independent value for each state. At most
         1000 states.
@@ -60,6 +61,7 @@ class Features:
     utility_bandwidth_factor: float = 1.0
     normalised_utility: bool = True
     constant_utility: bool = False
+    effort_utility: bool = False
     diffusion_utility: bool = False
     standardised_utility: bool = False
 
@@ -68,8 +70,8 @@ class Features:
         checks.whole("centres", self.centres)
         checks.positive("bandwidth_factor", self.bandwidth_factor)
         checks.positive("utility_bandwidth_factor", self.utility_bandwidth_factor)
-        for name in ("normalised_utility", "constant_utility", "diffusion_utility", "standardised_utility"):
-            checks.boolean(name, getattr(self, name))
+        for name in ("normalised", "constant", "effort", "diffusion", "standardised"):
+            checks.boolean(f"{name}_utility", getattr(self, f"{name}_utility"))
         if self.diffusion_utility and self.standardised_utility:
             raise ValueError("standardised_utility: expected false with diffusion_utility, got true")
 
@@ -86,6 +88,7 @@ class Features:
             self.utility_bandwidth_factor,
             normalised=self.normalised_utility,
             constant=self.constant_utility,
+            effort=self.effort_utility,
             diffusion=self.diffusion_utility,
             standardised=self.standardised_utility,
         )

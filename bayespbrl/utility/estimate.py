@@ -52,8 +52,8 @@ class UtilityEstimate(Protocol):
         """uᵢ of each transition."""
         ...
 
-    def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
-        """The utility wᵀφ(s) of n states, flattened as in `Trajectory.states`."""
+    def utilities(self, states: np.ndarray, *, actions: np.ndarray | None = None) -> Float[np.ndarray, " n"]:
+        """The utility wᵀφ of n states, flattened as in `Trajectory.states`; with `actions`, of n steps there."""
         ...
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
@@ -69,7 +69,7 @@ class UtilityEstimate(Protocol):
         ...
 
     def utilities_and_draws(
-        self, states: np.ndarray, *, number: int | None = None
+        self, states: np.ndarray, *, number: int | None = None, actions: np.ndarray | None = None
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
         """`utilities` of n states and S posterior draws of them, about `number`, in one pass over the features."""
         ...

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from bayespbrl.features import DiffusionBasis, RadialBasis, StateFeatures, linear
 from bayespbrl.models.threads import in_threads, one_blas_thread
-from bayespbrl.trajectories import Trajectory, trajectory_features
+from bayespbrl.trajectories import Trajectory, step_features, trajectory_features
 
 # The prior: a uniform distribution over settings of these multiples of the bandwidths as given; up to three dimensions,
 # over all of them. Functions hardly change along a dimension with the last.
@@ -66,12 +66,14 @@ def values_under(
     multiples: Float[np.ndarray, "c s"],
     states: np.ndarray,
     weights: Sequence[Float[np.ndarray, "d _"]],
+    *,
+    actions: np.ndarray | None = None,
 ) -> list[Float[np.ndarray, "n _"]]:
-    """φ(s)ᵀw of n states under each of C settings, with the weights of each side by side."""
+    """φᵀw of n states under each of C settings, with the weights of each side by side; with `actions` of n steps."""
     if not isinstance(features, RadialBasis) or len(multiples) == 1:
-        return [
-            linear(rescaled(features, row)(states), columns) for row, columns in zip(multiples, weights, strict=True)
-        ]
+        each = (rescaled(features, row) for row in multiples)
+        tables = (φ(states) if actions is None else step_features(φ, states, actions) for φ in each)
+        return [linear(table, columns) for table, columns in zip(tables, weights, strict=True)]
     values = [np.empty((len(states), columns.shape[1])) for columns in weights]
 
     def fill(start: int) -> None:
@@ -79,7 +81,9 @@ def values_under(
         for number, (kernel, shares) in enumerate(features.under(multiples, states[rows])):
             values[number][rows] = shares[:, None] * (kernel @ weights[number][: kernel.shape[1]])
             if features.constant:
-                values[number][rows] += features.constant * weights[number][-1]
+                values[number][rows] += features.constant * weights[number][kernel.shape[1]]
+            if features.effort and actions is not None:
+                values[number][rows] += features.efforts(actions[rows])[:, None] * weights[number][-1]
 
     _for_each(fill, range(0, len(states), ROWS_AT_A_TIME), rows=len(states), functions=len(features.centres))
     return values
@@ -97,12 +101,15 @@ def sums_under(
     if not isinstance(features, RadialBasis) or len(multiples) == 1:
         return [trajectory_features(trajectories, rescaled(features, row), discount=discount) for row in multiples]
     functions = len(features.centres)
-    sums = np.zeros((len(multiples), len(trajectories), functions + bool(features.constant)))
+    constant, effort = bool(features.constant), bool(features.effort)
+    sums = np.zeros((len(multiples), len(trajectories), functions + constant + effort))
 
     def add(i: int) -> None:
         trajectory = trajectories[i]
         discounts = discount ** np.arange(len(trajectory))
-        sums[:, i, functions:] = features.constant * discounts.sum()  # eq. 1
+        sums[:, i, functions : functions + constant] = features.constant * discounts.sum()  # eq. 1
+        if effort:
+            sums[:, i, -1] = discounts @ features.efforts(trajectory.actions)  # eq. 1
         for start in range(0, len(trajectory), ROWS_AT_A_TIME):
             rows = slice(start, start + ROWS_AT_A_TIME)
             for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):

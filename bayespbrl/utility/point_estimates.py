@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayespbrl.features import StateFeatures, linear
-from bayespbrl.trajectories import Trajectory, Transitions, trajectory_features
+from bayespbrl.trajectories import Trajectory, Transitions, step_features, trajectory_features
 from bayespbrl.utility.estimate import WithoutDraws, refused
 from bayespbrl.utility.quality import FitQuality
 
@@ -35,13 +35,14 @@ class LinearProgramUtility(WithoutDraws):
         """D."""
         return len(self.weights)
 
-    def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
-        """wᵀφ(s) of n states."""
-        return linear(self.features(states), self.weights)
+    def utilities(self, states: np.ndarray, *, actions: np.ndarray | None = None) -> Float[np.ndarray, " n"]:
+        """wᵀφ of n states, or with the actions that led there of n steps."""
+        values = self.features(states) if actions is None else step_features(self.features, states, actions)
+        return linear(values, self.weights)
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
-        """uᵢ = wᵀφ(sᵢ′) (paper, step 2): the utility of the *next* state, the same convention as in ψ."""
-        return self.utilities(steps.next_states)
+        """uᵢ = wᵀφ(sᵢ′) (paper, step 2): of the *next* state, as in ψ, and of the effort of the action."""
+        return self.utilities(steps.next_states, actions=steps.actions)
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
         """wᵀψ(τ) of each trajectory."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from xarray import DataTree
 
 from bayespbrl import checks
-from bayespbrl.features import StateFeatures, linear
+from bayespbrl.features import RadialBasis, StateFeatures, linear
 from bayespbrl.models.likelihoods import Likelihood, likelihood_of
 from bayespbrl.models.posterior_tree import next_lapse_rates, number_of_preferences
 from bayespbrl.trajectories import Trajectory, Transitions
@@ -23,7 +23,7 @@ INTERVAL = (0.05, 0.95)
 
 @dataclass(frozen=True)
 class PosteriorUtility:
-    """u(s′) = wᵀφ(s′) with draws of w, and of the length scales of φ, from their posterior.
+    """u(s′) = wᵀφ(s′), or u(a, s′) if effort counts, with draws of w and of the length scales of φ.
 
     Mean, draws, `quality` and `likelihood` are all of that one posterior.
 
@@ -82,9 +82,9 @@ class PosteriorUtility:
             return None
         return np.asarray(drawn["tie_threshold"].values[:, :: self._apart(number)].reshape(-1, 1))
 
-    def utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
-        """The utility of n states."""
-        return self._drawn(self._of_states(states), None)[0]
+    def utilities(self, states: np.ndarray, *, actions: np.ndarray | None = None) -> Float[np.ndarray, " n"]:
+        """The utility of n states, or with the actions that led there of n steps."""
+        return self._drawn(self._of_states(states, actions), None)[0]
 
     def mean_utilities(self, states: np.ndarray) -> Float[np.ndarray, " n"]:
         """The posterior mean of the utility of n states, whichever utility is acted on."""
@@ -98,14 +98,14 @@ class PosteriorUtility:
         return float(self.posterior.attrs["prior_scale"]) * np.sqrt(np.mean(variances, axis=0))
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
-        """uᵢ = wᵀφ(sᵢ′) (paper, step 2): the utility of the *next* state, the same convention as in ψ."""
-        return self.utilities(steps.next_states)
+        """uᵢ = wᵀφ(sᵢ′) (paper, step 2): of the *next* state, as in ψ, and of the effort of the action."""
+        return self.utilities(steps.next_states, actions=steps.actions)
 
     def utilities_and_draws(
-        self, states: np.ndarray, *, number: int | None = None
+        self, states: np.ndarray, *, number: int | None = None, actions: np.ndarray | None = None
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "s n"]]:
-        """The utility of n states and draws of it, from one evaluation of the features."""
-        return self._drawn(self._of_states(states), self._apart(number))
+        """`utilities` of n states or steps and draws of them, from one evaluation of the features."""
+        return self._drawn(self._of_states(states, actions), self._apart(number))
 
     def trajectory_utilities(self, trajectories: Sequence[Trajectory]) -> Float[np.ndarray, " n"]:
         """wᵀψ(τ) of each trajectory."""
@@ -126,7 +126,8 @@ class PosteriorUtility:
     def hyperparameters(self) -> dict[str, Any]:
         """Mean and 90 % interval of all that was inferred besides the weights, as plain data.
 
-        Of several answerers the lapse rate is that of `next_lapse_rates`, and the side bias is the mean.
+        Of several answerers the lapse rate is that of `next_lapse_rates`, and the side bias is the mean. The weight of
+        the effort is in prior standard deviations.
         """
         drawn = self.posterior.children["posterior"].dataset
         columns = {"lapse_rate": next_lapse_rates(self.posterior).ravel()} | {
@@ -134,6 +135,8 @@ class PosteriorUtility:
             for name in ("steepness", "tie_threshold", "side_bias")
             if name in drawn
         }
+        if isinstance(self.features, RadialBasis) and self.features.effort:
+            columns["effort"] = drawn["utility_weights"].values[..., -1].ravel() / self.posterior.attrs["prior_scale"]
         figures: dict[str, Any] = {name: float(values.mean()) for name, values in columns.items()}
         figures |= {
             f"{name} {'lower' if quantile < 0.5 else 'upper'}": float(np.quantile(values, quantile))
@@ -153,8 +156,10 @@ class PosteriorUtility:
         setting = self.posterior.children["posterior"].dataset["setting"]
         return spacing(setting.size, number)
 
-    def _of_states(self, states: np.ndarray) -> Evaluate:
-        return lambda settings, weights: values_under(self.features, self.multiples[settings], states, weights)
+    def _of_states(self, states: np.ndarray, actions: np.ndarray | None) -> Evaluate:
+        return lambda settings, weights: values_under(
+            self.features, self.multiples[settings], states, weights, actions=actions
+        )
 
     def _of_trajectories(self, trajectories: Sequence[Trajectory]) -> Evaluate:
         def values(settings: np.ndarray, weights: Sequence[np.ndarray]) -> list[np.ndarray]:

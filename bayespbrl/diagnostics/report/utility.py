@@ -60,7 +60,8 @@ def _what_else(found: Mapping[str, Any], settings: int) -> str:
         return f"{number(found[name])}" if low == high else f"{number(found[name])} ({number(low)} to {number(high)})"
 
     text = f"Lapse rate: {inferred('lapse_rate')}, steepness: {inferred('steepness')}"
-    for name, label in (("tie_threshold", "tie threshold"), ("side_bias", "side bias")):
+    effort = "weight of the effort of actions, in prior standard deviations"
+    for name, label in (("tie_threshold", "tie threshold"), ("side_bias", "side bias"), ("effort", effort)):
         text += f", {label}: {inferred(name)}" if name in found else ""
     text += ", with 90 % intervals where they are inferred."
     if settings > 1:
