@@ -116,10 +116,10 @@ Features = Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
 
 
 def step_features(
-    features: Features, next_states: Shaped[np.ndarray, "n ..."], actions: Shaped[np.ndarray, "n ..."]
+    features: Features, next_states: Shaped[np.ndarray, "n ..."], actions: Shaped[np.ndarray, "n ..."] | None
 ) -> Shaped[np.ndarray, "n d"]:
-    """φ of n steps: of the next state, and of the action where φ has a feature of it (`of_steps`)."""
-    of_steps = getattr(features, "of_steps", None)
+    """φ of n steps: of the next state, and of the action where φ has a feature of it (`of_steps`); None: of states."""
+    of_steps = None if actions is None else getattr(features, "of_steps", None)
     return features(next_states) if of_steps is None else of_steps(next_states, actions)
 
 
@@ -142,7 +142,8 @@ def trajectory_features(
     if not trajectories:
         raise ValueError("trajectory_features: expected at least one trajectory, got none")
     states, actions = (
-        np.concatenate(part) for part in zip(*((t.states[1:], t.actions) for t in trajectories), strict=True)
+        np.concatenate([t.states[1:] for t in trajectories]),
+        np.concatenate([t.actions for t in trajectories]),
     )
     table = step_features(features, states, actions)
     discounts = np.concatenate([discount ** np.arange(len(t)) for t in trajectories])

@@ -71,9 +71,11 @@ def values_under(
 ) -> list[Float[np.ndarray, "n _"]]:
     """φᵀw of n states under each of C settings, with the weights of each side by side; with `actions` of n steps."""
     if not isinstance(features, RadialBasis) or len(multiples) == 1:
-        each = (rescaled(features, row) for row in multiples)
-        tables = (φ(states) if actions is None else step_features(φ, states, actions) for φ in each)
-        return [linear(table, columns) for table, columns in zip(tables, weights, strict=True)]
+        return [
+            linear(step_features(rescaled(features, row), states, actions), columns)
+            for row, columns in zip(multiples, weights, strict=True)
+        ]
+    efforts = None if actions is None or not features.effort else features.efforts(actions)
     values = [np.empty((len(states), columns.shape[1])) for columns in weights]
 
     def fill(start: int) -> None:
@@ -82,8 +84,8 @@ def values_under(
             values[number][rows] = shares[:, None] * (kernel @ weights[number][: kernel.shape[1]])
             if features.constant:
                 values[number][rows] += features.constant * weights[number][kernel.shape[1]]
-            if features.effort and actions is not None:
-                values[number][rows] += features.efforts(actions[rows])[:, None] * weights[number][-1]
+            if efforts is not None:
+                values[number][rows] += efforts[rows, None] * weights[number][-1]
 
     _for_each(fill, range(0, len(states), ROWS_AT_A_TIME), rows=len(states), functions=len(features.centres))
     return values

@@ -37,8 +37,7 @@ class LinearProgramUtility(WithoutDraws):
 
     def utilities(self, states: np.ndarray, *, actions: np.ndarray | None = None) -> Float[np.ndarray, " n"]:
         """wᵀφ of n states, or with the actions that led there of n steps."""
-        values = self.features(states) if actions is None else step_features(self.features, states, actions)
-        return linear(values, self.weights)
+        return linear(step_features(self.features, states, actions), self.weights)
 
     def step_utilities(self, steps: Transitions) -> Float[np.ndarray, " n"]:
         """uᵢ = wᵀφ(sᵢ′) (paper, step 2): of the *next* state, as in ψ, and of the effort of the action."""

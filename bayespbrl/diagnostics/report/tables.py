@@ -100,17 +100,16 @@ def _by_last_estimate(
     estimate, tree = contents.estimate, contents.posterior
     if estimate is None or answer.row is None or answer.row >= estimate.quality.pairs:
         return np.nan, np.nan, np.nan
-    used, both = np.nan, _preferred_and_dominated(contents, answer)
-    if both is not None:
-        preferred, dominated = estimate.trajectory_utilities(both)
-        used = float(preferred - dominated)
-    if tree is None or margins is None:
-        return np.nan, used, np.nan
-    margin = margins[:, :, answer.row]
-    probability = np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row]))
-    if contents.settings.estimation.utility == "posterior-mean":  # also without the trajectories or their features
-        used = float(margin.mean())
-    return float(probability), used, float(margin.std())
+    probability = spread = np.nan
+    if tree is not None and margins is not None:
+        margin = margins[:, :, answer.row]
+        probability = float(np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row])))
+        spread = float(margin.std())
+        if contents.settings.estimation.utility == "posterior-mean":  # the margin of the utility that is acted on
+            return probability, float(margin.mean()), spread
+    both = _preferred_and_dominated(contents, answer)
+    used = np.nan if both is None else float(np.subtract(*estimate.trajectory_utilities(both)))
+    return probability, used, spread
 
 
 def prequential_table(contents: RunContents) -> xr.Dataset:
