@@ -80,23 +80,13 @@ class Cycle:
             return None
         if not state.collected:
             return self.collect(state)
-        newcomers = self._newcomers(state)
+        newcomers = state.newcomers
         last = state.in_last_iteration(self.settings)
         if not state.wanted or left <= 0 or not (newcomers or others):
             return None if last and others else self.improve(state)
         if others and (not newcomers or others >= (min(left, state.wanted) if last else left)):
             return None
         return self.show(state, answerer)
-
-    def _newcomers(self, state: LearnerState) -> list[int]:
-        """The candidates that no open question compares with their opponents."""
-        taken = [{query.first, query.second} for query in state.open]
-        taken += [{past.first, past.second} for past in state.past if state.opponents]  # also of each other
-        standing = state.preferences.undominated
-        # an opponent of this iteration that is now undominated would compete with itself
-        left = set(state.candidates).difference(standing, (query.newcomer for query in state.open))
-        pairs = {number: {number, state.opponents.get(number, *standing[-1:])} for number in state.candidates}
-        return [number for number, pair in pairs.items() if number in left and pair not in taken]
 
     def collect(self, state: LearnerState) -> Entry:
         """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
@@ -153,9 +143,16 @@ class Cycle:
             return questions.first_questions(new, opponents, options, rng=rng)
         signal = None if state.bound is None else state.bound.signal
         noise_free = new[-1] if self._shows_kept(state) else None
+        if options.against_kept and noise_free is not None and favourite > 0:
+            opponents |= {noise_free: best[-1]}
         given = QuerySituation(
             new, known, state.shown, standing[-1], state.estimate, signal, rng, opponents, standing, noise_free
         )
+        if state.restart is not None and options.against_kept:
+            if state.kept == state.iteration:
+                return questions.confirmation(given, options, state.preferences)
+            if state.left(self.settings) <= self.settings.confirmations:
+                return questions.Chosen()
         return questions.later_questions(self.query_rule, given, options, state.preferences, unasked=state.unasked)
 
     def _of_iteration(self, number: int) -> range:
@@ -178,7 +175,7 @@ class Cycle:
 
     def show(self, state: LearnerState, answerer: str | None = None) -> Entry:
         """Step 4: the next question, the best candidate against its opponent, or a repeated one; `asked`."""
-        number, newcomer, options = state.queries + 1, self._newcomers(state)[0], self.settings.questions
+        number, newcomer, options = state.queries + 1, state.newcomers[0], self.settings.questions
         left = options.left(state.preferences.answers + state.wanted + len(state.open))
         rng, who = self._rng(REPEAT, number), {} if answerer is None else {"answerer": answerer}
         waiting = [each.repeats for each in state.open]
@@ -187,11 +184,14 @@ class Cycle:
             shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
             return _entry({"event": "asked", "query": number, **shown, "repeats": again.number, **who})
         preferences = state.preferences
-        incumbent = opponent_now(newcomer, state.opponents, state.trajectories, preferences)
+        last = newcomer == len(state.trajectories) - 1
+        duel = options.against_kept and last and self._shows_kept(state) and bool(state.opponents)
+        given = state.opponents if options.same_start or duel else {}
+        incumbent = given[newcomer] if duel else opponent_now(newcomer, given, state.trajectories, preferences)
         query = queries.show(number, newcomer, incumbent, state.compared, rng=self._rng(SHOW, number))
         shown = {"first": query.first, "second": query.second, "newcomer": newcomer}
         event = {"event": "asked", "query": number, **shown, **who}
-        if options.same_start:
+        if options.same_start or duel:
             tied = preferences.tied_with(incumbent)
             event["rivals"] = [each for each in rivals(query, state.trajectories, preferences) if each in tied]
         return _entry(event)

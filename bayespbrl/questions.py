@@ -37,6 +37,9 @@ class Questions:
       informative_ties: whether, while all answers are ties, it counts as information whether the next is one
         (`queries.ONLY_TIES`).
       worthwhile: whether a question is left out whose answer is expected to tell less than `LEAST_INFORMATION`.
+      against_kept: whether a policy without its noise (`noise_free`) is compared with the one that is kept, without its
+        noise too. The best trajectory so far is a lucky one: a loss against it says little about which of two policies
+        is better. A tenth of the answers is then left for a restarted policy, which is asked about before it is kept.
       clip_steps: length of the part of each trajectory, drawn at random, that questions are about; None: all of it. A
         person sees a part in seconds.
       repeats: share of the questions that are an earlier one with sides swapped. They are for people: the answers tell
@@ -54,6 +57,7 @@ class Questions:
     informative_ties: bool = False
     worthwhile: bool = False
     clip_steps: int | None = None
+    against_kept: bool = False
     repeats: float = 0.0
     shared_repeats: bool = False
 
@@ -65,7 +69,7 @@ class Questions:
         checks.share("repeats", self.repeats, below_one=True)
         checks.optional(checks.whole, "answers", self.answers)
         checks.optional(checks.whole, "clip_steps", self.clip_steps)
-        for name in ("same_start", "informative_ties", "worthwhile", "shared_repeats"):
+        for name in ("same_start", "informative_ties", "worthwhile", "against_kept", "shared_repeats"):
             checks.boolean(name, getattr(self, name))
         if self.shared_repeats and not self.repeats:
             raise ValueError("shared_repeats: expected false without repeats, got true")
@@ -144,13 +148,28 @@ def later_questions(
         return Chosen()
     others = () if skipped else (number for number in candidates(rule, situation) if number not in doubted)
     order, opponents, information = (*doubted, *others), None, None
-    if options.same_start:
+    if options.same_start or situation.opponents:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)
     if situation.estimate.posterior is not None:
         information = float(replace(situation, new=order[:1]).information()[0])
     worth = not (options.worthwhile and preferences.pairs) or information is None or information >= LEAST_INFORMATION
     wanted = options.within_budget(options.queries_per_iteration, preferences.answers) if worth else 0
     return Chosen(wanted, order, opponents, information)
+
+
+def confirmation(situation: QuerySituation, options: Questions, preferences: Preferences) -> Chosen:
+    """The question about the policy without its noise, whatever the posterior expects, where it was restarted.
+
+    Decision: where the run would keep it. It was made from a posterior that has seen no trajectory of it, so that it
+    is better by what was learned, or by what the posterior has wrong.
+    """
+    wanted = options.within_budget(1, preferences.answers)
+    if situation.noise_free is None or not wanted:
+        return Chosen()
+    number, information = situation.noise_free, None
+    if situation.estimate.posterior is not None:
+        information = float(replace(situation, new=[number]).information()[0])
+    return Chosen(wanted, (number,), (situation.opponents.get(number, situation.incumbent),), information)
 
 
 def repeated(

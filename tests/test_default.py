@@ -211,6 +211,26 @@ def test_a_restarted_run_that_was_stopped_or_undone_goes_on_bit_for_bit(restarte
     assert finished.state.kept == restarted.learner.state.kept
 
 
+def test_policies_without_noise_are_compared_with_what_the_run_keeps_and_a_restarted_one_before_it_is_kept():
+    shown = {"noise_free": True, "against_kept": True, "worthwhile": False, "answers": 10, "restart_iterations": 8}
+    run, expert, duels, confirmed = Learner(Slope(), **FAST | shown | {"seed": 5}), ReturnExpert(), [], []
+    while query := run.ask():
+        state, (newcomer, incumbent) = run.state, (query[0].newcomer, query[0].incumbent)
+        kept = state.best if state.restart is None else min(state.restart.number, state.started - 1)
+        if kept and newcomer == len(run.trajectories) - 1:  # the last of an iteration has no noise
+            assert incumbent == 10 * kept + 9
+            duels.append(state.iteration)
+        if state.restart is not None:
+            assert state.kept == state.iteration > state.started
+            confirmed.append(state.iteration)
+        run.tell([expert(*query[0].trajectories)])
+    at_restart = next(each for each in run.iterations if each["iteration"] == run.state.restart.iteration)
+    assert at_restart["answers"] == 9  # a tenth is left
+    assert len(confirmed) == 1
+    assert set(confirmed) < set(duels)
+    assert run.preferences.answers == 10
+
+
 class Plain:
     """A policy of a user's with neither `mode` nor anything else of ours: a standard normal action."""
 

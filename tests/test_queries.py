@@ -19,7 +19,7 @@ from bayespbrl.queries import (
     random_candidates,
     show,
 )
-from bayespbrl.questions import LEAST_INFORMATION, Questions, first_questions, later_questions
+from bayespbrl.questions import LEAST_INFORMATION, Questions, confirmation, first_questions, later_questions
 from bayespbrl.trajectories import Trajectory
 
 
@@ -348,6 +348,25 @@ def test_a_policy_without_its_noise_is_asked_about_while_the_posterior_doubts_it
     assert (chosen.wanted, chosen.candidates) == expected
     without = replace(given, noise_free=None)
     assert later_questions(QUERY_RULES["highest-utility"], without, options, after, unasked=0).wanted == 0
+
+
+@pytest.mark.parametrize(
+    ("noise_free", "answers", "opponents", "expected"),
+    [
+        (2, 8, {}, (1, (2,), (3,))),
+        (2, 8, {2: 1}, (1, (2,), (1,))),
+        (None, 8, {}, (0, (), None)),
+        (2, 20, {}, (0, (), None)),
+    ],
+)
+def test_a_restarted_policy_is_asked_about_though_the_posterior_is_sure(noise_free, answers, opponents, expected):
+    draws = np.column_stack([np.full(100, 30.0), np.full(100, 20.0), np.full(100, 9.0)])
+    given = replace(situation(draws, np.zeros(100)), noise_free=noise_free, opponents=opponents)
+    given.estimate.posterior = "drawn"
+    options = Questions(answers=20, worthwhile=True)
+    chosen = confirmation(given, options, Preferences(((0, 1),), (0,), answers))
+    assert (chosen.wanted, chosen.candidates, chosen.opponents) == expected
+    assert chosen.information is None or chosen.information < 1e-6
 
 
 @pytest.mark.parametrize(("signal", "sure"), [(0.49, False), (0.51, True)])

@@ -54,6 +54,7 @@ BAD = {
     "standardised_utility": [None, 1, "yes"],
     "informative_ties": [None, 1, "yes"],
     "noise_free": [None, 1, "yes"],
+    "against_kept": [None, 1, "yes"],
     "preset": ["fast", "", None],
     "answers": [0, -1, 2.5, True],
     "same_start": [None, 1, "yes"],

@@ -141,6 +141,17 @@ class LearnerState:
         return self.open[0] if self.open else None
 
     @property
+    def newcomers(self) -> list[int]:
+        """The candidates that no open question compares with their opponents."""
+        taken = [{query.first, query.second} for query in self.open]
+        taken += [{past.first, past.second} for past in self.past if self.opponents]  # also of each other
+        standing = self.preferences.undominated
+        # an opponent of this iteration that is now undominated would compete with itself
+        left = set(self.candidates).difference(standing, (query.newcomer for query in self.open))
+        pairs = {number: {number, self.opponents.get(number, *standing[-1:])} for number in self.candidates}
+        return [number for number, pair in pairs.items() if number in left and pair not in taken]
+
+    @property
     def previous(self) -> "LearnerState | None":
         """The state before the last answer; None where no answer can be taken back."""
         return replace(self.before[-1], before=self.before[:-1]) if self.before else None

@@ -242,16 +242,22 @@ class Settings:
         """Number of iterations of the restarted policy."""
         return self.update.restart_iterations if self.update.checked and self.iterations is None else 0
 
+    @property
+    def confirmations(self) -> int:
+        """Answers that are left for the restarted policy, where trajectories without noise are shown: a tenth."""
+        budget = self.questions.answers
+        return round(budget / 10) if self.questions.against_kept and self._restarted and budget is not None else 0
+
     def restarts(self, iteration: int, answers: int, unasked: int) -> bool:
         """Whether to restart the policy: answers or iterations are used up, or no question is worthwhile.
 
         Decision: at once after the last answer, since nobody is asked about what the first policy does then, but not
-        before it had as many iterations as a run without a second policy ends with.
+        before it had as many iterations as a run without a second policy ends with. `confirmations` are left over.
         """
-        budget = self.questions.answers
+        budget, last = self.questions.answers, self.most_iterations - self._restarted
         if not self._restarted or budget is None or iteration < LAST_ITERATIONS:
             return False
-        return answers >= budget or unasked >= MOST_UNASKED or iteration >= self.most_iterations - self._restarted
+        return answers >= budget - self.confirmations or unasked >= MOST_UNASKED or iteration >= last
 
     def last_iteration(self, started: int = 0) -> int:
         """The last iteration that a run can have; `started` as in `finished`."""
