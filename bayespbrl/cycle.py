@@ -145,6 +145,8 @@ class Cycle:
         noise_free = new[-1] if self._shows_kept(state) else None
         if options.against_kept and noise_free is not None and favourite > 0:
             opponents |= {noise_free: best[-1]}
+        if options.same_start and noise_free not in opponents:
+            noise_free = None
         given = QuerySituation(
             new, known, state.shown, standing[-1], state.estimate, signal, rng, opponents, standing, noise_free
         )

@@ -28,6 +28,7 @@ QUERY_DRAWS = 500
 MOST_OLDER = 20  # their draws would soon cost more than all else
 # Answers of which all are ties: from so many on it counts as information whether the next is one too.
 ONLY_TIES = 4
+STAKE = 0.02  # of the spread of the utilities of what was shown
 DOUBT = 0.25  # nats that an answer is expected to tell: of draws that are sure each, less than 0.93 agree
 
 
@@ -79,6 +80,23 @@ class QuerySituation:
             return ()
         number = self.noise_free
         return (number,) if replace(self, new=[number]).information()[0] >= DOUBT else ()
+
+    def at_stake(self) -> tuple[int, ...]:
+        """The trajectory without noise, where it is worth `STAKE` to know whether its opponent is better; else none.
+
+        That is worth the expected utility of the better one less that of the one chosen now, E max(u, u') −
+        max(E u, E u'), as a share of the standard deviation of the utilities of what was shown.
+
+        Decision: this, and not information, where the two are policies of which the run keeps one. Two that hardly act
+        differ little, but an answer about them tells as much as any.
+        """
+        if self.noise_free is None or self.estimate.posterior is None:
+            return ()
+        opponent = self.opponents.get(self.noise_free, self.incumbent)
+        numbers = [self.noise_free, opponent, *sorted(self.shown)]
+        draws = self.estimate.trajectory_draws([self.trajectories[n] for n in numbers], number=QUERY_DRAWS)
+        worth = draws[:, :2].max(axis=1).mean() - draws[:, :2].mean(axis=0).max()
+        return (self.noise_free,) if worth >= STAKE * draws[:, 2:].std(axis=1).mean() else ()
 
     def information(self) -> Float[np.ndarray, " n"]:
         """The `expected_information` of a question about each new trajectory."""

@@ -142,7 +142,11 @@ def later_questions(
     """
     if options.informative_ties and not preferences.pairs:
         situation = replace(situation, only_ties=preferences.answers)
-    doubted = situation.doubted() if preferences.pairs and options.left(preferences.answers) > 0 else ()
+    doubted: tuple[int, ...] = ()
+    if preferences.pairs and options.left(preferences.answers) > 0:
+        doubted = situation.at_stake() if options.against_kept else situation.doubted()
+    if not (doubted or options.same_start):
+        situation = replace(situation, opponents={})  # it is a trajectory like any other
     skipped = options.skips(preferences, unasked, situation.estimate, situation.signal)
     if skipped and not doubted:
         return Chosen()

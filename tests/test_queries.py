@@ -351,6 +351,33 @@ def test_a_policy_without_its_noise_is_asked_about_while_the_posterior_doubts_it
 
 
 @pytest.mark.parametrize(
+    ("margin", "chance", "expected"),
+    [
+        (3.0, 0.5, (2,)),  # E max − max E = 1.5, where what was shown has a standard deviation of 5
+        (3.0, 0.04, (2,)),  # 0.12
+        (3.0, 0.02, ()),  # 0.06, below a fiftieth of 5
+        (3.0, 1.0, ()),  # its opponent is better for sure
+        (0.1, 0.5, ()),  # nobody knows which of the two is better, and it hardly matters
+    ],
+)
+def test_a_policy_without_noise_is_asked_about_where_it_matters_which_of_the_two_is_kept(margin, chance, expected):
+    """Trajectory 2 is without noise, 1 its opponent, 0 and 3 were shown."""
+    opponents = np.where(np.arange(100) < 100 * chance, margin, -margin) + 20.0
+    draws = np.column_stack([np.full(100, 30.0), opponents, np.full(100, 20.0)])
+    given = replace(situation(draws, np.full(100, 20.0)), noise_free=2, opponents={2: 1}, shown=frozenset({0, 3}))
+    assert given.at_stake() == ()  # no posterior
+    given.estimate.posterior, given.estimate.quality = "drawn", SimpleNamespace(converged=True)
+    assert given.at_stake() == expected
+    assert replace(given, noise_free=None).at_stake() == ()
+    options, after = Questions(answers=20, against_kept=True), Preferences(((0, 3),), (3,), 8)
+    chosen = later_questions(QUERY_RULES["highest-utility"], given, options, after, unasked=0)
+    assert chosen.candidates[0] == (2 if expected else 0)
+    assert (chosen.opponents is not None) == bool(expected)
+    if expected:
+        assert chosen.opponents[:2] == (1, 3)
+
+
+@pytest.mark.parametrize(
     ("noise_free", "answers", "opponents", "expected"),
     [
         (2, 8, {}, (1, (2,), (3,))),

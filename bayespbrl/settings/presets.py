@@ -93,6 +93,10 @@ TASKS = {
 # The Gridworld is without what the default has come to do where states are discrete: its figures are older.
 TASKS["gridworld"] |= dict.fromkeys(("standardised_utility", "informative_ties", "noise_free"), False)
 TASKS["gridworld"] |= {"critic_iterations": 4}
+# So are those of the two with continuous actions.
+WITHOUT_EFFORT = dict.fromkeys(("effort_utility", "noise_free", "against_kept"), False)
+TASKS["swing-up"] |= WITHOUT_EFFORT
+TASKS["bicycle"] |= WITHOUT_EFFORT
 # An environment object of the user's is known by its gymnasium id.
 IDS = {identity: short for short, identity in SHORT_NAMES.items()}
 DEFAULT: dict[str, Any] = {
@@ -152,6 +156,8 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
             options |= MEASURED[measured](task)
     if not chosen.get("checked", True):
         options.pop("noise_free", None)  # such a run keeps the newest policy, with its noise
+    if not chosen.get("noise_free", options.get("noise_free")):
+        options.pop("against_kept", None)
     if chosen.get("diffusion_utility"):
         options.pop("standardised_utility", None)  # the other kind of features of discrete states
     if people:

@@ -192,6 +192,8 @@ class Settings:
         if self.estimation.plain_draws is not None and None in (self.model.steepness, self.model.lapse_rate):
             given = f"{self.model.steepness} and {self.model.lapse_rate}"
             raise ValueError(f"plain_draws: expected numbers as steepness and lapse_rate, got {given}")
+        if self.questions.against_kept and not self.rollouts.noise_free:
+            raise ValueError("against_kept: expected false without noise_free, got true")
         if query in BY_SIGNAL and schedule != "confidence":
             raise ValueError(f"schedule: expected confidence with the query rule {query}, got {schedule!r}")
         if self.wrong_answers and self.expert not in SIMULATED:

@@ -56,20 +56,28 @@ class Task:
         policy fails in an episode is a matter of luck, so more of them check it. A policy of discrete states, a table,
         is not stuck, and is not started anew; its Q is a table too, and forgets nothing by old transitions. Its
         goals may be rare: one that few trajectories reach counts as much, and ties tell of it. Without its noise it may
-        stay somewhere for good, which trajectories with it do not show.
+        stay somewhere for good, which trajectories with it do not show. Continuous actions may cost something by
+        themselves, and with them a policy that hardly acts may seem good, which duels of policies without noise rule
+        out; people see states rather than actions, and would wait for the last duels.
         """
         continuous = isinstance(self.action_space, Box)
         dimensions = self.observation_space.shape[0] if isinstance(self.observation_space, Box) else 0
         of_a_table = {"restart_iterations": 0, "critic_iterations": None, "noise_free": True}
         of_rare_goals = {"standardised_utility": True, "informative_ties": True}
-        return ({} if dimensions else of_a_table | of_rare_goals) | {
-            "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
-            "exploration_hold": None if continuous else 1,
-            "trajectories_per_iteration": TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS,
-            "check_episodes": (8 if people else 32) if continuous else (40 if people else 100),
-            "centres": 300 if continuous else 100,
-            "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
-        }
+        of_effort = {"effort_utility": True, "noise_free": True, "against_kept": True}
+        special = {} if dimensions else of_a_table | of_rare_goals
+        return (
+            special
+            | (of_effort if continuous and not people else {})
+            | {
+                "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
+                "exploration_hold": None if continuous else 1,
+                "trajectories_per_iteration": TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS,
+                "check_episodes": (8 if people else 32) if continuous else (40 if people else 100),
+                "centres": 300 if continuous else 100,
+                "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
+            }
+        )
 
     def more_trajectories(self) -> dict[str, Any]:
         """More trajectories an iteration where the first episodes end at once, if actions are continuous or states not.
