@@ -5,15 +5,14 @@ Each method takes what the learner knows and returns the next event; none change
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import gymnasium
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from bayespbrl import events, queries, questions, rollouts
+from bayespbrl import events, queries, questions
+from bayespbrl.collection import CHOOSE, CLIPS, FEATURES, FIT, IMPROVE, REPEAT, SHOW, VISITED, Collection
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
@@ -24,35 +23,27 @@ from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, state
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.models.threads import one_blas_thread
-from bayespbrl.policies import Policy, Sampler, greedy
-from bayespbrl.policies.policy import has_mode
-from bayespbrl.preferences import opponent_now, opponents_from_the_same_start, rivals
+from bayespbrl.policies import greedy
+from bayespbrl.preferences import Answer, opponent_now, opponents_from_the_same_start, rivals
 from bayespbrl.queries import QuerySituation
-from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory, clips_of, transitions
 from bayespbrl.utility.comparisons import Comparisons
 from bayespbrl.utility.estimate import UtilityEstimate
 from bayespbrl.utility.inference import estimate
 
-# Each random choice has a stream of its own, named by (seed, purpose, count): what is redone comes out the same.
-COLLECT, CHOOSE, SHOW, FEATURES, FIT, IMPROVE, EVALUATE, VISITED, STARTS, REPEAT, CLIPS, CHECK, NOISE_FREE = range(13)
 # Posterior draws that a schedule looks at. Each costs a column of LSTD; the spread of a gain is known to a tenth.
 SCHEDULE_DRAWS = 100
 
 
 @dataclass(frozen=True)
-class Cycle:
+class Cycle(Collection):
     """The parts that stay the same over a run.
 
     Attributes:
-      settings: all options.
-      environment: opened.
       feature_source: draws the features.
       schedule, query_rule: of the KL bound, and of the questions.
     """
 
-    settings: Settings
-    environment: gymnasium.Env
     feature_source: FeatureSource
     schedule: schedules.Schedule
     query_rule: queries.QueryRule
@@ -105,34 +96,6 @@ class Cycle:
         }
         return _entry(event, trajectories=collected)
 
-    def _collected(self, state: LearnerState, policy: Policy) -> tuple[Trajectory, ...]:
-        """New trajectories, the last without the policy's noise where `_shows_kept`."""
-        options, iteration = self.settings.rollouts, state.iteration
-        number = options.trajectories_per_iteration
-        noisy = number - self._shows_kept(state)
-        first = [len(each) for each in state.trajectories[:number]]
-        hold = options.hold(first or [step_limit(self.environment, options.max_steps)])
-        starts = self._starts(iteration)[:noisy] if self.settings.questions.same_start else None
-        explored = self._roll(policy, self._key(COLLECT, iteration), noisy, hold=hold, starts=starts)
-        if noisy == number:
-            return explored
-        start = self.reset_seed(iteration * number + noisy)
-        return explored + self._roll(greedy(policy), self._key(NOISE_FREE, iteration), 1, starts=[start])
-
-    def _shows_kept(self, state: LearnerState) -> bool:
-        """Whether the last new trajectory is without noise: where that is asked for, and an update made the policy."""
-        updated = state.iteration > state.started and not state.restarts(self.settings)
-        return self.settings.rollouts.noise_free and updated and has_mode(state.policy)
-
-    def _tried(self, policy: Sampler) -> tuple[Trajectory, ...]:
-        """Trajectories without the policy's noise, from starts that are the same for all policies of the run."""
-        options = self.settings.update
-        return self._roll(greedy(policy), self._key(CHECK, 0), options.check_episodes) if options.checked else ()
-
-    def _roll(self, policy: Sampler, key: jax.Array, episodes: int, **how: Any) -> tuple[Trajectory, ...]:
-        limit = self.settings.rollouts.max_steps
-        return rollouts.rollout(self.environment, policy, key=key, episodes=episodes, max_steps=limit, **how)
-
     def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> questions.Chosen:
         options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)
         favourite = state.best if state.restart is None else min(state.restart.number, state.started - 1)
@@ -142,38 +105,42 @@ class Cycle:
         if state.estimate is None or not standing:  # none: all were skipped
             return questions.first_questions(new, opponents, options, rng=rng)
         signal = None if state.bound is None else state.bound.signal
-        noise_free = new[-1] if self._shows_kept(state) else None
-        if options.against_kept and noise_free is not None and favourite > 0:
-            opponents |= {noise_free: best[-1]}
-        if options.same_start and noise_free not in opponents:
-            noise_free = None
+        silent = self._without_noise(state) and not state.restarts(self.settings)
+        if options.against_kept and silent:
+            opponents |= {new[-1]: new[-2]}
         given = QuerySituation(
-            new, known, state.shown, standing[-1], state.estimate, signal, rng, opponents, standing, noise_free
+            new,
+            known,
+            state.shown,
+            standing[-1],
+            state.estimate,
+            signal,
+            rng,
+            opponents,
+            standing,
+            noise_free=new[-1] if silent else None,
         )
-        if state.restart is not None and options.against_kept:
-            if state.kept == state.iteration:
-                return questions.confirmation(given, options, state.preferences)
-            if state.left(self.settings) <= self.settings.confirmations:
-                return questions.Chosen()
+        if self._nominated(state, state.estimate):
+            return questions.confirmation(given, options, state.preferences)
+        if options.answers is not None:
+            options = replace(options, answers=options.answers - self.settings.confirmations)
         return questions.later_questions(self.query_rule, given, options, state.preferences, unasked=state.unasked)
+
+    def _nominated(self, state: LearnerState, utility: UtilityEstimate) -> bool:
+        """Whether the restarted policy is to be asked about: the kept one would give way to it.
+
+        Decision: late, because it still learns: with two answers left in the last four iterations, with one in two.
+        """
+        if state.restart is None or not self.settings.confirmations or state.iteration == state.started:
+            return False
+        remaining = self.settings.last_iteration(state.started) - state.iteration
+        soon = remaining <= 2 * state.left(self.settings)
+        return soon and clearly_better(utility, state.tried, state.restart.tried)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""
         each = self.settings.rollouts.trajectories_per_iteration
         return range(number * each, (number + 1) * each)
-
-    def _starts(self, iteration: int) -> list[int]:
-        """The seeds of the resets, the same in each iteration; in the first each start has two trajectories."""
-        number = self.settings.rollouts.trajectories_per_iteration
-        first = int(self._rng(STARTS, 0).integers(2**30))
-        return [first + (i // 2 if iteration == 0 else i) for i in range(number)]
-
-    def reset_seed(self, number: int) -> int:
-        """The seed with which the environment was reset for a trajectory, where it is stepped by its interface."""
-        iteration, episode = divmod(number, self.settings.rollouts.trajectories_per_iteration)
-        if self.settings.questions.same_start:
-            return self._starts(iteration)[episode]
-        return rollouts.reset_seed(self._key(COLLECT, iteration)) + episode
 
     def show(self, state: LearnerState, answerer: str | None = None) -> Entry:
         """Step 4: the next question, the best candidate against its opponent, or a repeated one; `asked`."""
@@ -186,14 +153,13 @@ class Cycle:
             shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
             return _entry({"event": "asked", "query": number, **shown, "repeats": again.number, **who})
         preferences = state.preferences
-        last = newcomer == len(state.trajectories) - 1
-        duel = options.against_kept and last and self._shows_kept(state) and bool(state.opponents)
+        duel = options.against_kept and state.opponents.get(newcomer) == newcomer - 1 == len(state.trajectories) - 2
         given = state.opponents if options.same_start or duel else {}
         incumbent = given[newcomer] if duel else opponent_now(newcomer, given, state.trajectories, preferences)
         query = queries.show(number, newcomer, incumbent, state.compared, rng=self._rng(SHOW, number))
         shown = {"first": query.first, "second": query.second, "newcomer": newcomer}
-        event = {"event": "asked", "query": number, **shown, **who}
-        if options.same_start or duel:
+        event = {"event": "asked", "query": number, **shown, **who, **({"duel": True} if duel else {})}
+        if options.same_start and not duel:
             tied = preferences.tied_with(incumbent)
             event["rivals"] = [each for each in rivals(query, state.trajectories, preferences) if each in tied]
         return _entry(event)
@@ -230,23 +196,14 @@ class Cycle:
             "hyperparameters": utility.hyperparameters(),
         }
         event = {"check": result, "kept": kept, "bound": asdict(bound), "value": value, "summary": summary}
+        if state.restart is not None and self.settings.confirmations and kept != state.restart.number:
+            event["confirmed"] = True
         return _entry(
             {"event": "improved", "iteration": newest, **event},
             trajectories=state.trajectories[-options.trajectories_per_iteration :],
             tried=tried,
             policy=improved.policy,
             estimate=utility,
-        )
-
-    def evaluated(self, policy: Sampler) -> rollouts.Returns:
-        """Fresh episodes, the same for all policies of the run; the learner never sees them."""
-        options = self.settings.rollouts
-        return rollouts.returns(
-            self.environment,
-            policy,
-            key=self._key(EVALUATE, 0),
-            episodes=options.evaluation_episodes,
-            max_steps=options.max_steps,
         )
 
     def _check(self, state: LearnerState, utility: UtilityEstimate) -> tuple[Check, Float[np.ndarray, " n"] | None]:
@@ -264,15 +221,18 @@ class Cycle:
         check = checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
         return check, newest if check.best == state.iteration else best
 
-    @staticmethod
     def _kept(
+        self,
         state: LearnerState,
         utility: UtilityEstimate,
         check: Check | None,
         of_best: Float[np.ndarray, " n"] | None,
         tried: tuple[Trajectory, ...],
     ) -> int:
-        """The number of the policy that the run keeps now, by the trajectories `tried` of the newest, and of others."""
+        """The number of the policy that the run keeps now, by the trajectories `tried` of the newest, and of others.
+
+        Where answers are left for a restarted policy, it is kept once it was asked about and still is clearly better.
+        """
         newest = state.iteration + 1
         if check is None:
             return newest
@@ -280,6 +240,11 @@ class Cycle:
         kept = newest if better else check.best
         if state.restart is None:
             return kept
+        if self.settings.confirmations:
+            answered = {past.newcomer for past in state.past if past.answer is not Answer.SKIP}
+            asked = state.iteration > state.started and len(state.trajectories) - 1 in answered
+            confirmed = asked and clearly_better(utility, state.tried, state.restart.tried)
+            return state.iteration if confirmed else state.restart.number
         if not better:
             tried = state.tried if check.best == state.iteration else state.best_tried
         return kept if clearly_better(utility, tried, state.restart.tried) else state.restart.number
@@ -338,12 +303,6 @@ class Cycle:
             updates=settings.update.updates_per_iteration,
         )
         return improved, bound
-
-    def _rng(self, purpose: int, count: int) -> np.random.Generator:
-        return np.random.default_rng([self.settings.seed, purpose, count])
-
-    def _key(self, purpose: int, count: int) -> jax.Array:
-        return jax.random.key(int(self._rng(purpose, count).integers(2**31)))
 
 
 def _entry(event: dict[str, Any], **parts: Any) -> Entry:

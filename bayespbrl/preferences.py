@@ -44,6 +44,7 @@ class Query:
         new question.
       rivals: the undominated trajectories that the newcomer competes with; None: all.
       answerer: who is asked, where several people answer at once; None: whoever answers.
+      duel: whether it is about the two alone, as a repeated question: the undominated trajectories stay.
     """
 
     number: int
@@ -54,6 +55,7 @@ class Query:
     repeats: int | None = None
     rivals: tuple[int, ...] | None = None
     answerer: str | None = None
+    duel: bool = False
 
     @property
     def incumbent(self) -> int:

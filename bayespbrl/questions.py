@@ -142,15 +142,19 @@ def later_questions(
     """
     if options.informative_ties and not preferences.pairs:
         situation = replace(situation, only_ties=preferences.answers)
-    doubted: tuple[int, ...] = ()
+    doubted, kept = tuple[int, ...](), tuple[int, ...]()
     if preferences.pairs and options.left(preferences.answers) > 0:
         doubted = situation.at_stake() if options.against_kept else situation.doubted()
-    if not (doubted or options.same_start):
-        situation = replace(situation, opponents={})  # it is a trajectory like any other
+    if options.against_kept and doubted and options.worthwhile:
+        doubted = doubted if replace(situation, new=doubted).information()[0] >= LEAST_INFORMATION else ()
+    if options.against_kept and doubted:
+        kept = (situation.opponents[doubted[0]],)
+    elif not options.same_start:
+        situation = replace(situation, opponents={})  # the policy without noise is compared like any other
     skipped = options.skips(preferences, unasked, situation.estimate, situation.signal)
     if skipped and not doubted:
         return Chosen()
-    others = () if skipped else (number for number in candidates(rule, situation) if number not in doubted)
+    others = () if skipped else (n for n in candidates(rule, situation) if n not in (*doubted, *kept))
     order, opponents, information = (*doubted, *others), None, None
     if options.same_start or situation.opponents:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)

@@ -32,7 +32,7 @@ ROOMS = {
     "baselines": ["baselines"],
     "settings": ["settings"],
     "events": ["events"],
-    "learner": ["learner", "cycle"],
+    "learner": ["learner", "cycle", "collection"],
     "runs": ["runs"],
     "people": ["people"],
     "diagnostics": ["diagnostics"],

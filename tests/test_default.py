@@ -14,7 +14,7 @@ import xarray as xr
 from toys import Slope, fingerprint
 
 import bayespbrl
-from bayespbrl import Learner, ReturnExpert, cycle, rollouts
+from bayespbrl import Learner, ReturnExpert, collection, rollouts
 from bayespbrl.envs import opening
 from bayespbrl.events import answered
 from bayespbrl.improvement.check import Check
@@ -146,7 +146,7 @@ def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
     drawn = rollouts.rollout(
         restarted.learner.environment,
         first,
-        key=restarted.learner.cycle._key(cycle.COLLECT, began),
+        key=restarted.learner.cycle._key(collection.COLLECT, began),
         episodes=10,
         hold=restarted.learner.settings.rollouts.hold([len(each) for each in restarted.trajectories[:10]]),
         max_steps=8,
@@ -339,7 +339,7 @@ def test_each_random_choice_has_a_stream_of_its_own(monkeypatch):
     of_an_update = {(cycle.IMPROVE, n) for n in range(4)}  # fresh actions by a key, the fit by a generator
     assert {stream for stream, times in drawn.items() if times > 1} == of_all_policies | of_an_update
     assert len(learner.iterations) == 4
-    each = {(purpose, n) for purpose in (cycle.COLLECT, cycle.FIT, cycle.VISITED) for n in range(4)}
+    each = {(purpose, n) for purpose in (collection.COLLECT, cycle.FIT, cycle.VISITED) for n in range(4)}
     assert each | {(cycle.FEATURES, n) for n in range(8)} <= set(drawn)
 
 

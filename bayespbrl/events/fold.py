@@ -66,7 +66,10 @@ def _improved(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str,
     kept = best if found["kept"] is None else operator.index(found["kept"])
     if check is not None and best not in (state.best, state.iteration):
         raise ValueError(f"improved: expected {state.best} or {state.iteration} as the best, got {best}")
-    if kept not in (best, iteration, *(() if state.restart is None else (state.restart.number,))):
+    restart, confirmed = state.restart, event.get("confirmed", False)
+    if confirmed and restart is not None:
+        restart = replace(restart, number=state.iteration, policy=state.policy, tried=state.tried)
+    if kept not in (best, iteration, *(() if restart is None else (restart.number,))):
         raise ValueError(f"improved: expected policy {best} or {iteration} to be kept, got {kept}")
     last_is_best = best == state.iteration
     return replace(
@@ -78,6 +81,7 @@ def _improved(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str,
         tried=tuple(parts.get("tried", ())),
         best_tried=state.tried if last_is_best else state.best_tried,
         trust=1.0 if check is None else float(check["trust"]),
+        restart=restart,
         estimate=parts["estimate"],
         bound=Bound(**found["bound"]),
         values=(*state.values, float(found["value"])),
@@ -158,7 +162,7 @@ def _asked(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         newest = incumbent in state.preferences.undominated[-1:]
         rivals = state.preferences.tied_with(incumbent) if newest else None
     rivals = None if rivals is None else tuple(rivals)
-    query = Query(event["query"], *shown, event["newcomer"], both, repeats, rivals, answerer)
+    query = Query(event["query"], *shown, event["newcomer"], both, repeats, rivals, answerer, event.get("duel", False))
     return replace(state, open=(*state.open, query), queries=query.number, shown=state.shown.union(shown))
 
 
@@ -179,9 +183,10 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
     if answer is Answer.SKIP:
         return after
     preferred = {Answer.FIRST: query.first, Answer.SECOND: query.second, Answer.TIE: None}[answer]
-    if again:
+    wanted = max(0, state.wanted - 1)
+    if again or query.duel:
         more = state.preferences.add_repeated(query.first, query.second, preferred=preferred, answerer=answerer)
-        return replace(after, preferences=more)
+        return replace(after, preferences=more, wanted=state.wanted if again else wanted)
     preferences = state.preferences.add(
         query.newcomer,
         query.incumbent,
@@ -190,4 +195,4 @@ def _answered(state: LearnerState, event: Mapping[str, Any]) -> LearnerState:
         shown_first=query.first,
         answerer=answerer,
     )
-    return replace(after, preferences=preferences, wanted=max(0, state.wanted - 1))
+    return replace(after, preferences=preferences, wanted=wanted)

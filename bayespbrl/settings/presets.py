@@ -156,12 +156,14 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
             options |= MEASURED[measured](task)
     if not chosen.get("checked", True):
         options.pop("noise_free", None)  # such a run keeps the newest policy, with its noise
-    if not chosen.get("noise_free", options.get("noise_free")):
-        options.pop("against_kept", None)
     if chosen.get("diffusion_utility"):
         options.pop("standardised_utility", None)  # the other kind of features of discrete states
     if people:
         options |= PEOPLE
+    shown = chosen.get("noise_free", options.get("noise_free"))
+    alone = chosen.get("clip_steps") is not None or not chosen.get("checked", True)
+    if not shown or alone or chosen.get("utility") in WITHOUT_POSTERIOR:
+        options.pop("against_kept", None)
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":
         options["query"] = WITHOUT_DRAWS[0]
     return options

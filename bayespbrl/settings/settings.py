@@ -192,8 +192,13 @@ class Settings:
         if self.estimation.plain_draws is not None and None in (self.model.steepness, self.model.lapse_rate):
             given = f"{self.model.steepness} and {self.model.lapse_rate}"
             raise ValueError(f"plain_draws: expected numbers as steepness and lapse_rate, got {given}")
-        if self.questions.against_kept and not self.rollouts.noise_free:
-            raise ValueError("against_kept: expected false without noise_free, got true")
+        if self.questions.against_kept:
+            if not (self.rollouts.noise_free and self.update.checked):
+                raise ValueError("against_kept: expected false unless noise_free and checked, got true")
+            if (number := self.rollouts.trajectories_per_iteration) < 3:
+                raise ValueError(f"trajectories_per_iteration: expected at least 3 with against_kept, got {number}")
+            if utility in WITHOUT_POSTERIOR:
+                raise ValueError(f"against_kept: expected false with {utility}, which has no posterior, got true")
         if query in BY_SIGNAL and schedule != "confidence":
             raise ValueError(f"schedule: expected confidence with the query rule {query}, got {schedule!r}")
         if self.wrong_answers and self.expert not in SIMULATED:
@@ -246,9 +251,9 @@ class Settings:
 
     @property
     def confirmations(self) -> int:
-        """Answers that are left for the restarted policy, where trajectories without noise are shown: a tenth."""
+        """Answers that are left for the restarted policy, where policies are compared with what is kept: a tenth."""
         budget = self.questions.answers
-        return round(budget / 10) if self.questions.against_kept and self._restarted and budget is not None else 0
+        return (budget + 5) // 10 if self.questions.against_kept and self._restarted and budget is not None else 0
 
     def restarts(self, iteration: int, answers: int, unasked: int) -> bool:
         """Whether to restart the policy: answers or iterations are used up, or no question is worthwhile.
