@@ -106,7 +106,7 @@ class Cycle(Collection):
             return questions.first_questions(new, opponents, options, rng=rng)
         signal = None if state.bound is None else state.bound.signal
         silent = self._without_noise(state) and not state.restarts(self.settings)
-        if options.against_kept and silent:
+        if options.against_kept and silent and favourite > 0:  # the first policy without noise does the same everywhere
             opponents |= {new[-1]: new[-2]}
         given = QuerySituation(
             new,

@@ -40,8 +40,7 @@ class Query:
       first, second: numbers of the two trajectories in the order shown, which is drawn at random.
       newcomer: number of the new one; the other is its opponent.
       trajectories: the two trajectories, in the order shown.
-      repeats: number of the earlier question about the same two, which were then shown the other way round; None for a
-        new question.
+      repeats: number of the earlier question about the same two, shown the other way round; None: it is a new one.
       rivals: the undominated trajectories that the newcomer competes with; None: all.
       answerer: who is asked, where several people answer at once; None: whoever answers.
       duel: whether it is about the two alone, as a repeated question: the undominated trajectories stay.

@@ -147,7 +147,7 @@ def later_questions(
         doubted = situation.at_stake() if options.against_kept else situation.doubted()
     if options.against_kept and doubted and options.worthwhile:
         doubted = doubted if replace(situation, new=doubted).information()[0] >= LEAST_INFORMATION else ()
-    if options.against_kept and doubted:
+    if options.against_kept and set(doubted) & set(situation.opponents):
         kept = (situation.opponents[doubted[0]],)
     elif not options.same_start:
         situation = replace(situation, opponents={})  # the policy without noise is compared like any other

@@ -14,7 +14,7 @@ import xarray as xr
 from toys import Slope, fingerprint
 
 import bayespbrl
-from bayespbrl import Learner, ReturnExpert, collection, rollouts
+from bayespbrl import Learner, ReturnExpert, collection, cycle, rollouts
 from bayespbrl.envs import opening
 from bayespbrl.events import answered
 from bayespbrl.improvement.check import Check
@@ -42,6 +42,16 @@ def restarted(tmp_path_factory):
     options = {"answers": 4, "same_start": True, "restart_iterations": 3, **FAST}
     bayespbrl.start(Slope(), directory, **options).run(ReturnExpert())
     return bayespbrl.load(directory, env=Slope())
+
+
+class Memory:
+    """A log in memory."""
+
+    def __init__(self):
+        self.entries = []
+
+    def append(self, entry, state):
+        self.entries.append(entry)
 
 
 def test_the_budget_ends_the_questions_and_the_run_a_little_later(run):
@@ -84,7 +94,8 @@ def test_the_two_of_a_question_start_alike(run):
     starts = [trajectory.states[0].tobytes() for trajectory in run.trajectories]
     assert starts[0] == starts[1] != starts[2]  # two of each at first
     assert starts[10:20] == starts[20:30]
-    assert len(set(starts[10:20])) == 10
+    assert len(set(starts[10:20])) == 9
+    assert starts[18] == starts[19]  # the two policies without noise
     assert run.learner.comparable_starts
 
 
@@ -147,12 +158,12 @@ def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
         restarted.learner.environment,
         first,
         key=restarted.learner.cycle._key(collection.COLLECT, began),
-        episodes=10,
+        episodes=8,
         hold=restarted.learner.settings.rollouts.hold([len(each) for each in restarted.trajectories[:10]]),
         max_steps=8,
-        starts=restarted.learner.cycle._starts(began),
+        starts=restarted.learner.cycle._starts(began)[:8],
     )
-    for mine, other in zip(restarted.trajectories[10 * began : 10 * began + 10], drawn, strict=True):
+    for mine, other in zip(restarted.trajectories[10 * began : 10 * began + 8], drawn, strict=True):
         np.testing.assert_array_equal(mine.actions, other.actions)
     checks = [summary["check"] for summary in restarted.iterations[began:]]
     assert [check["best"] for check in checks[:2]] == [began, began + 1]
@@ -212,24 +223,40 @@ def test_a_restarted_run_that_was_stopped_or_undone_goes_on_bit_for_bit(restarte
     assert finished.state.kept == restarted.learner.state.kept
 
 
-def test_policies_without_noise_are_compared_with_what_the_run_keeps_and_a_restarted_one_before_it_is_kept():
-    shown = {"noise_free": True, "against_kept": True, "worthwhile": False, "answers": 10, "restart_iterations": 8}
-    run, expert, duels, confirmed = Learner(Slope(), **FAST | shown | {"seed": 5}), ReturnExpert(), [], []
+@pytest.mark.parametrize("seed", [5, 6])
+def test_policies_are_compared_without_noise_and_a_restarted_one_before_it_is_kept(seed):
+    sizes = FAST | {"answers": 10, "restart_iterations": 8, "worthwhile": False, "seed": seed}
+    run, expert, log, duels = Learner(Slope(), **sizes), ReturnExpert(), Memory(), []
+    run.logged(log)
     while query := run.ask():
-        state, (newcomer, incumbent) = run.state, (query[0].newcomer, query[0].incumbent)
-        kept = state.best if state.restart is None else min(state.restart.number, state.started - 1)
-        if kept and newcomer == len(run.trajectories) - 1:  # the last of an iteration has no noise
-            assert incumbent == 10 * kept + 9
-            duels.append(state.iteration)
-        if state.restart is not None:
-            assert state.kept == state.iteration > state.started
-            confirmed.append(state.iteration)
+        state, number = run.state, len(run.trajectories)
+        if query[0].duel:
+            assert (query[0].newcomer, query[0].incumbent) == (number - 1, number - 2)
+            duels.append((state.iteration, state.best if state.restart is None else state.restart.number))
+            undominated = state.preferences.undominated
         run.tell([expert(*query[0].trajectories)])
-    at_restart = next(each for each in run.iterations if each["iteration"] == run.state.restart.iteration)
-    assert at_restart["answers"] == 9  # a tenth is left
-    assert len(confirmed) == 1
-    assert set(confirmed) < set(duels)
-    assert run.preferences.answers == 10
+        if query[0].duel:
+            assert run.preferences.undominated == undominated
+            assert {number - 1, number - 2} == set(run.preferences.pairs[-1])
+    policies = [run.first_policy(), *(e.parts["policy"] for e in log.entries if e.event["event"] == "improved")]
+    for newest, kept in duels:
+        last_two = run.trajectories[10 * newest + 8 : 10 * newest + 10]
+        np.testing.assert_array_equal(last_two[0].states[0], last_two[1].states[0])
+        for policy, trajectory in zip((kept, newest), last_two, strict=True):
+            as_kept = [greedy(policies[policy]).sample(None, state) for state in trajectory.states[:-1]]
+            np.testing.assert_allclose(trajectory.actions, np.clip(as_kept, -1, 1), atol=1e-5)
+    restart = run.state.restart
+    before = [e["answers"] for e in run.iterations if e["iteration"] <= restart.iteration + 1]
+    assert max(before) <= 9  # a tenth is left
+    confirmed = [newest for newest, _ in duels if newest > restart.iteration]
+    assert confirmed
+    assert restart.number == run.state.kept
+    assert run.state.kept in (*confirmed, *(e["kept"] for e in run.iterations if e["iteration"] == restart.iteration))
+    assert fingerprint(replayed(run, log)) == fingerprint(run)
+
+
+def replayed(run, log):
+    return Learner(Slope(), entries=log.entries, kept=run.settings)
 
 
 class Plain:
