@@ -75,6 +75,8 @@ class Questions:
             raise ValueError("shared_repeats: expected false without repeats, got true")
         if self.same_start and self.clip_steps is not None:
             raise ValueError("same_start: expected false with clip_steps, because clips begin at any step, got true")
+        if self.against_kept and self.clip_steps is not None:
+            raise ValueError("against_kept: expected false with clip_steps, because clips begin at any step, got true")
 
     def clips(self, trajectories: Sequence[Trajectory], *, rng: np.random.Generator) -> list[list[int]] | None:
         """First step and number of steps of the part of each trajectory that is compared; None: all of it."""

@@ -121,11 +121,31 @@ def test_changes_win_over_presets_none_too():
     assert settings_for("SomebodysEnv-v3") == Settings.from_options("SomebodysEnv-v3", DEFAULT)
 
 
+COMPARED = {"against_kept": True, "noise_free": True}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"seed": 2**63}, "seed: expected at most 9223372036854775807"),
         ({"wrong_answers": 0.3, "expert": "page"}, "wrong_answers: expected 0 with the expert page, got 0.3"),
+        ({"against_kept": True}, "against_kept: expected false unless noise_free and checked, got true"),
+        (
+            {"against_kept": True, "noise_free": True, "checked": False},
+            "against_kept: expected false unless noise_free",
+        ),
+        (
+            COMPARED | {"trajectories_per_iteration": 2, "first_queries": 1},
+            "expected at least 3 with against_kept, got 2",
+        ),
+        (
+            COMPARED | {"utility": "linear-program"},
+            "against_kept: expected false with linear-program, which has no post",
+        ),
+        (
+            COMPARED | {"clip_steps": 20},
+            "against_kept: expected false with clip_steps, because clips begin at any step",
+        ),
     ],
 )
 def test_options_that_could_have_no_effect_are_refused(options, message):
@@ -196,6 +216,33 @@ def test_where_states_are_discrete_goals_may_be_rare():
     assert options("SomebodysEnv-v3", replace(longer, horizon=10)) == ((True, True), None, 0, 80)
     assert not settings_for("SomebodysEnv-v3", task=table, checked=False).rollouts.noise_free  # it keeps the newest
     assert options("gridworld", table) == ((False, False), 4, 0, 10)  # as its figures were measured
+
+
+def test_continuous_actions_have_effort_and_their_policies_are_compared_without_noise():
+    def options(env="SomebodysEnv-v3", **chosen):
+        settings = settings_for(env, task=TASK, **chosen)
+        return settings.features.effort_utility, settings.rollouts.noise_free, settings.questions.against_kept
+
+    assert options() == (True, True, True)
+    assert options(expert="page") == (False, False, False)  # people see states, and would wait
+    assert options("swing-up") == options("bicycle") == (False, False, False)  # as their figures were measured
+    assert options(preset="paper") == (False, False, False)
+    for without in ({"noise_free": False}, {"checked": False}):
+        assert options(**without) == (True, False, False)
+    for without in ({"clip_steps": 20}, {"utility": "linear-program"}, {"utility": "known-reward"}):
+        assert options(**without) == (True, True, False)
+    discrete = replace(TASK, action_space=Discrete(2))
+    assert not settings_for("SomebodysEnv-v3", task=discrete).questions.against_kept
+
+
+@pytest.mark.parametrize(("answers", "left"), [(4, 0), (5, 1), (14, 1), (15, 2), (20, 2), (50, 5)])
+def test_a_tenth_of_the_answers_is_left_for_a_policy_that_is_started_anew(answers, left):
+    settings = settings_for("SomebodysEnv-v3", task=TASK, answers=answers)
+    assert settings.confirmations == left
+    assert settings.restarts(iteration=5, answers=answers - left, unasked=0)
+    assert not settings.restarts(iteration=5, answers=answers - left - 1, unasked=0)
+    assert settings_for("SomebodysEnv-v3", task=TASK, answers=answers, iterations=9).confirmations == 0
+    assert settings_for("SomebodysEnv-v3", task=TASK, answers=answers, restart_iterations=0).confirmations == 0
 
 
 def test_discrete_states_have_one_kind_of_features():
