@@ -1,7 +1,8 @@
 """Step 4: which trajectories to ask about, and the question "this one or the best so far?" (paper, step 4).
 
 A query rule orders trajectories; the first is asked about, the next when that question is skipped or more are asked.
-Before it comes a policy without its noise that the posterior doubts (`QuerySituation.doubted`).
+Before it comes a policy without its noise that the posterior doubts (`QuerySituation.doubted`), or of which it matters
+whether it is better than the one that is kept (`QuerySituation.at_stake`).
 Undominated trajectories in the order, as the incumbent, are left out: they are what the others are compared with.
 
 Three lines make one of your own, for `Learner(query=...)`:

@@ -139,8 +139,8 @@ def later_questions(
     """The questions that `rule` chooses, after `unasked` iterations in a row without any.
 
     None where the iteration skips them, or the best is not worth asking once an answer stated an order. From then on
-    the policy without its noise comes first where the posterior is in doubt about it, alone if the iteration would
-    have been skipped.
+    the policy without its noise comes first where the posterior is in doubt about it, or where it matters whether it is
+    better than the kept one, alone if the iteration would have been skipped.
     """
     if options.informative_ties and not preferences.pairs:
         situation = replace(situation, only_ties=preferences.answers)

@@ -18,7 +18,8 @@ class Restart:
 
     Attributes:
       iteration: iterations completed by then.
-      number, policy, tried: of the policy that the run kept by then: its number, and its trajectories without noise.
+      number, policy, tried: of the policy that the run kept by then, or of a restarted one that an answer confirmed
+        since: its number, and its trajectories without noise.
     """
 
     iteration: int
@@ -42,7 +43,7 @@ class LearnerState:
       tried, best_tried: trajectories of the newest and of the best policy without their noise, where updates are
         checked; () where there are none.
       trust: share of the KL bound that the next update may use; it falls after a step back.
-      restart: when the policy was started anew, and what was kept by then; None: it was not.
+      restart: when the policy was started anew, and what was kept by then, or by an answer since; None: it was not.
       estimate: the last utility estimate; None before the first.
       bound: the last decision on the KL bound; None before the first.
       values: of each iteration's policy, by its number from 1, for reports alone.

@@ -106,7 +106,8 @@ class Rollouts:
         steps, then by the mean length of the first trajectories, which may end early. Evaluations never hold it.
       noise_free: whether the last trajectory of each iteration but the first follows the policy without its noise, as
         the run keeps it. Once an answer stated an order, a question is about it wherever the posterior is in doubt
-        (`queries.DOUBT`), whatever the rule, also in an iteration that would ask nothing.
+        (`queries.DOUBT`), whatever the rule, also in an iteration that would ask nothing. With `against_kept` the last
+        but one is of the policy that is kept, and the two are compared where that matters.
       evaluation_episodes: fresh episodes for the value of an iteration; the learner never sees them.
       policy: the kind of policy. `auto` takes tabular for discrete states, softmax for discrete actions in continuous
         states, gaussian-process otherwise; `other` is a policy of the user's.
@@ -258,8 +259,8 @@ class Settings:
     def restarts(self, iteration: int, answers: int, unasked: int) -> bool:
         """Whether to restart the policy: answers or iterations are used up, or no question is worthwhile.
 
-        Decision: at once after the last answer, since nobody is asked about what the first policy does then, but not
-        before it had as many iterations as a run without a second policy ends with. `confirmations` are left over.
+        Decision: at once after the last answer, but for `confirmations`, since nobody is asked about what the first
+        policy does then, but not before it had as many iterations as a run without a second policy ends with.
         """
         budget, last = self.questions.answers, self.most_iterations - self._restarted
         if not self._restarted or budget is None or iteration < LAST_ITERATIONS:
