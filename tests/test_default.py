@@ -362,7 +362,7 @@ def test_each_random_choice_has_a_stream_of_its_own(monkeypatch):
 
     monkeypatch.setattr(cycle.Cycle, "_rng", counted)
     learner = Learner(Slope(), answers=4, same_start=True, iterations=4, repeats=0.2, **FAST).run(ReturnExpert())
-    of_all_policies = {(cycle.EVALUATE, 0), (cycle.CHECK, 0), (cycle.STARTS, 0)}
+    of_all_policies = {(collection.EVALUATE, 0), (collection.CHECK, 0), (collection.STARTS, 0)}
     of_an_update = {(cycle.IMPROVE, n) for n in range(4)}  # fresh actions by a key, the fit by a generator
     assert {stream for stream, times in drawn.items() if times > 1} == of_all_policies | of_an_update
     assert len(learner.iterations) == 4
