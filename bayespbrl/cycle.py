@@ -120,22 +120,22 @@ class Cycle(Collection):
             standing,
             noise_free=new[-1] if silent else None,
         )
-        if self._nominated(state, state.estimate):
+        if self._nominated(state):
             return questions.confirmation(given, options, state.preferences)
         if options.answers is not None:
             options = replace(options, answers=options.answers - self.settings.confirmations)
         return questions.later_questions(self.query_rule, given, options, state.preferences, unasked=state.unasked)
 
-    def _nominated(self, state: LearnerState, utility: UtilityEstimate) -> bool:
+    def _nominated(self, state: LearnerState) -> bool:
         """Whether the restarted policy is to be asked about: the kept one would give way to it.
 
         Decision: late, because it still learns: with two answers left in the last four iterations, with one in two.
         """
-        if state.restart is None or not self.settings.confirmations or state.iteration == state.started:
+        if state.restart is None or state.estimate is None or state.iteration == state.started:
             return False
         remaining = self.settings.last_iteration(state.started) - state.iteration
-        soon = remaining <= 2 * state.left(self.settings)
-        return soon and clearly_better(utility, state.tried, state.restart.tried)
+        soon = self.settings.confirmations > 0 and remaining <= 2 * state.left(self.settings)
+        return soon and clearly_better(state.estimate, state.tried, state.restart.tried)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""

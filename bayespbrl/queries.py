@@ -79,8 +79,7 @@ class QuerySituation:
         """
         if self.noise_free is None or self.estimate.posterior is None:
             return ()
-        number = self.noise_free
-        return (number,) if replace(self, new=[number]).information()[0] >= DOUBT else ()
+        return (self.noise_free,) if self.told_by(self.noise_free) >= DOUBT else ()
 
     def at_stake(self) -> tuple[int, ...]:
         """The trajectory without noise, where it is worth `STAKE` to know whether its opponent is better; else none.
@@ -98,6 +97,10 @@ class QuerySituation:
         draws = self.estimate.trajectory_draws([self.trajectories[n] for n in numbers], number=QUERY_DRAWS)
         worth = draws[:, :2].max(axis=1).mean() - draws[:, :2].mean(axis=0).max()
         return (self.noise_free,) if worth >= STAKE * draws[:, 2:].std(axis=1).mean() else ()
+
+    def told_by(self, number: int) -> float:
+        """What the answer to the question about one trajectory is expected to tell, in nats."""
+        return float(replace(self, new=[number]).information()[0])
 
     def information(self) -> Float[np.ndarray, " n"]:
         """The `expected_information` of a question about each new trajectory."""

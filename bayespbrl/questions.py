@@ -147,8 +147,8 @@ def later_questions(
     doubted, kept = tuple[int, ...](), tuple[int, ...]()
     if preferences.pairs and options.left(preferences.answers) > 0:
         doubted = situation.at_stake() if options.against_kept else situation.doubted()
-    if options.against_kept and doubted and options.worthwhile:
-        doubted = doubted if replace(situation, new=doubted).information()[0] >= LEAST_INFORMATION else ()
+    if options.against_kept and options.worthwhile:
+        doubted = tuple(number for number in doubted if situation.told_by(number) >= LEAST_INFORMATION)
     if options.against_kept and set(doubted) & set(situation.opponents):
         kept = (situation.opponents[doubted[0]],)
     elif not options.same_start:
@@ -161,7 +161,7 @@ def later_questions(
     if options.same_start or situation.opponents:
         opponents = tuple(situation.opponents.get(number, situation.incumbent) for number in order)
     if situation.estimate.posterior is not None:
-        information = float(replace(situation, new=order[:1]).information()[0])
+        information = situation.told_by(order[0])
     worth = not (options.worthwhile and preferences.pairs) or information is None or information >= LEAST_INFORMATION
     wanted = options.within_budget(options.queries_per_iteration, preferences.answers) if worth else 0
     return Chosen(wanted, order, opponents, information)
@@ -176,9 +176,8 @@ def confirmation(situation: QuerySituation, options: Questions, preferences: Pre
     wanted = options.within_budget(1, preferences.answers)
     if situation.noise_free is None or not wanted:
         return Chosen()
-    number, information = situation.noise_free, None
-    if situation.estimate.posterior is not None:
-        information = float(replace(situation, new=[number]).information()[0])
+    number = situation.noise_free
+    information = None if situation.estimate.posterior is None else situation.told_by(number)
     return Chosen(wanted, (number,), (situation.opponents.get(number, situation.incumbent),), information)
 
 

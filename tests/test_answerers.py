@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
-from toys import QUICK, fingerprint
+from toys import QUICK, Memory, fingerprint
 
 from bayespbrl import (
     Answer,
@@ -36,19 +36,6 @@ from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.utility.comparisons import Comparisons
 
 OPTIONS = QUICK | {"iterations": 2}
-
-
-class Memory:
-    """A log in memory."""
-
-    def __init__(self):
-        self.entries = []
-
-    def append(self, entry, state):
-        self.entries.append(entry)
-
-    def answers(self):
-        return [entry.event for entry in self.entries if entry.event["event"] == "answered"]
 
 
 def remembered(**changes):

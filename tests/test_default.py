@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from toys import Slope, fingerprint
+from toys import Memory, Slope, fingerprint
 
 import bayespbrl
 from bayespbrl import Learner, ReturnExpert, collection, cycle, rollouts
@@ -42,16 +42,6 @@ def restarted(tmp_path_factory):
     options = {"answers": 4, "same_start": True, "restart_iterations": 3, **FAST}
     bayespbrl.start(Slope(), directory, **options).run(ReturnExpert())
     return bayespbrl.load(directory, env=Slope())
-
-
-class Memory:
-    """A log in memory."""
-
-    def __init__(self):
-        self.entries = []
-
-    def append(self, entry, state):
-        self.entries.append(entry)
 
 
 def test_the_budget_ends_the_questions_and_the_run_a_little_later(run):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 from threadpoolctl import threadpool_info, threadpool_limits
-from toys import QUICK, Push, Slope, fingerprint
+from toys import QUICK, Memory, Push, Slope, fingerprint
 
 from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, questions, resume, rollouts, start
 from bayespbrl import cycle as cycle_module
@@ -23,16 +23,6 @@ from bayespbrl.models import restored, stored
 from bayespbrl.models.threads import one_blas_thread
 from bayespbrl.policies import LinearGaussianPolicy, TabularPolicy
 from bayespbrl.trajectories import transitions
-
-
-class Memory:
-    """A log in memory."""
-
-    def __init__(self):
-        self.entries = []
-
-    def append(self, entry, state):
-        self.entries.append(entry)
 
 
 def learner(entries=(), **changes):

@@ -19,6 +19,19 @@ INTERRUPTIBLE = [sys.executable, "-c", f"{HEARS_INTERRUPTS}; from bayespbrl.cli.
 READY = ".bp-box[data-phase=question][data-locked=false]"
 
 
+class Memory:
+    """A log in memory."""
+
+    def __init__(self):
+        self.entries = []
+
+    def append(self, entry, state):
+        self.entries.append(entry)
+
+    def answers(self):
+        return [entry.event for entry in self.entries if entry.event["event"] == "answered"]
+
+
 class Slope(gymnasium.Env):
     """A point pushed along a line; goes wrong at the n-th step of its life if told so."""
 

@@ -66,18 +66,16 @@ class Task:
         of_rare_goals = {"standardised_utility": True, "informative_ties": True}
         of_effort = {"effort_utility": True, "noise_free": True, "against_kept": True}
         special = {} if dimensions else of_a_table | of_rare_goals
-        return (
-            special
-            | (of_effort if continuous and not people else {})
-            | {
-                "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
-                "exploration_hold": None if continuous else 1,
-                "trajectories_per_iteration": TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS,
-                "check_episodes": (8 if people else 32) if continuous else (40 if people else 100),
-                "centres": 300 if continuous else 100,
-                "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
-            }
-        )
+        if continuous and not people:
+            special = special | of_effort
+        return special | {
+            "discount": min(max(1 - 4 / self.horizon, 0.98), 0.995),
+            "exploration_hold": None if continuous else 1,
+            "trajectories_per_iteration": TRAJECTORIES if continuous else OF_DISCRETE_ACTIONS,
+            "check_episodes": (8 if people else 32) if continuous else (40 if people else 100),
+            "centres": 300 if continuous else 100,
+            "bandwidth_factor": 0.5 if dimensions <= 3 else 1.0 if dimensions <= 4 else 2.0,
+        }
 
     def more_trajectories(self) -> dict[str, Any]:
         """More trajectories an iteration where the first episodes end at once, if actions are continuous or states not.
