@@ -474,6 +474,7 @@ def test_answers_that_only_effort_explains_are_explained_by_it(method, bandwidth
         assert estimate.quality.pairs_satisfied == len(pairs)
     if method == "posterior-mean":
         assert np.corrcoef(utilities[16:], -efforts[16:])[0, 1] > 0.6  # of walks that nobody judged
+        assert estimate.hyperparameters()["effort counts"] > 0.7 or not bandwidth
     steps = transitions(walks[:1])
     assert np.sum(estimate.step_utilities(steps)) == pytest.approx(utilities[0])
     # a state alone is worth what a step there without any effort is

@@ -54,12 +54,18 @@ def test_a_step_earns_the_utility_of_its_effort_too(tmp_path, utility):
         taken = np.array([[min(action, 2.0)]])  # as the environment takes it
         states = observation[None].astype(float)
         assert reward == pytest.approx(run.estimate.utilities(states, actions=taken)[0])
-        part = run.estimate.features.efforts(taken) * run.estimate.weights[..., -1].sum()
+        weights = run.estimate.weights[..., -1]
+        counts = run.estimate.multiples[:, -1] if utility == "posterior-mean" else 1.0
+        part = run.estimate.features.efforts(taken) * np.sum(counts * weights)
         assert reward == pytest.approx(run.estimate.utilities(states)[0] + part[0])
     learner = bayespbrl.resume(tmp_path / "run")
     assert learner.estimate.features.effort == run.estimate.features.effort
-    told = "weight of the effort of actions, in prior standard deviations: " in run.report("md").read_text()
-    assert told == (utility == "posterior-mean")
+    report = run.report("md").read_text()
+    for text in (
+        "weight of the effort of actions, in prior standard deviations: ",
+        "That effort counts has probability",
+    ):
+        assert (text in report) == (utility == "posterior-mean")
 
 
 def test_caution_subtracts_standard_deviations(pendulum):

@@ -53,8 +53,19 @@ class RadialBasis:
         return np.square(matrix("actions", actions, columns=len(self.effort))) @ np.array(self.effort)
 
     def rescaled(self, multiples: ArrayLike) -> Self:
-        """The same centres with bandwidths `multiples` times as wide, one number or one per dimension."""
-        return replace(self, bandwidths=self.bandwidths * np.asarray(multiples))
+        """The same centres with bandwidths `multiples` times as wide, one number or one per dimension.
+
+        With one more, the feature of the effort is multiplied by it.
+        """
+        multiples, dimensions = np.asarray(multiples), len(self.bandwidths)
+        if multiples.ndim == 0 or len(multiples) <= dimensions:
+            return replace(self, bandwidths=self.bandwidths * multiples)
+        effort = tuple((np.array(self.effort) * multiples[dimensions]).tolist())
+        return replace(self, bandwidths=self.bandwidths * multiples[:dimensions], effort=effort)
+
+    def effort_multiples(self, multiples: Float[np.ndarray, "c s"]) -> Float[np.ndarray, " c"]:
+        """By what each row of multiples multiplies the feature of the effort; 1 where it says nothing of it."""
+        return multiples[:, len(self.bandwidths) :].prod(axis=1)
 
     def under(
         self, multiples: Float[np.ndarray, "c s"], observations: ArrayLike
@@ -65,7 +76,12 @@ class RadialBasis:
         """
         points = matrix("observations", observations, columns=self.centres.shape[1])
         return radial_basis_under(
-            multiples, points, self.centres, self.bandwidths, self.period, normalised=self.normalised
+            multiples[:, : len(self.bandwidths)],
+            points,
+            self.centres,
+            self.bandwidths,
+            self.period,
+            normalised=self.normalised,
         )
 
 

@@ -1,4 +1,4 @@
-"""The settings of the features that the posterior is over: multiples of the bandwidths, one for each state dimension.
+"""The settings of the features that the posterior is over: multiples of the bandwidths, and whether effort counts.
 
 A few answers hardly tell "high is good" from "fast is good". Under one choice of length scales the posterior would be
 sure of the one or the other; over all of them it says how sure the answers make it (Hoeting, Madigan, Raftery and
@@ -29,10 +29,27 @@ MANY = 6  # dimensions; beyond, the prior has settings in which one alone matter
 def bandwidth_multiples(
     features: StateFeatures, *, inferred: bool, rng: np.random.Generator
 ) -> Float[np.ndarray, "c s"]:
-    """Multiples of the bandwidths of φ, one row for each of C settings; one row of ones where nothing is inferred."""
+    """Multiples of the bandwidths of φ, one row for each of C settings; one row of ones where nothing is inferred.
+
+    With a feature of the effort there is one column more, by which that is multiplied: 1, or 0 where it does not count.
+
+    Decision: it counts in every other setting (of one or two dimensions, in each with and without), because in many
+    tasks it does not, and a few answers about actions at random seem to say that it does (docs/tuning.md).
+    """
     dimensions = len(features.bandwidths) if isinstance(features, RadialBasis | DiffusionBasis) else 0
+    effort = isinstance(features, RadialBasis) and bool(features.effort)
     if not inferred or not dimensions:
-        return np.ones((1, dimensions))
+        return np.ones((1, dimensions + effort))
+    multiples = _length_scales(dimensions, rng)
+    if not effort:
+        return multiples
+    if 2 * len(multiples) <= MOST_SETTINGS:
+        multiples = np.repeat(multiples, 2, axis=0)
+    return np.column_stack([multiples, np.arange(len(multiples)) % 2])
+
+
+def _length_scales(dimensions: int, rng: np.random.Generator) -> Float[np.ndarray, "c s"]:
+    """Multiples of the bandwidths in lexicographic order."""
     if len(MULTIPLES) ** dimensions <= MOST_SETTINGS:
         return np.array(list(itertools.product(MULTIPLES, repeat=dimensions)))
     chosen = {(multiple,) * dimensions for multiple in MULTIPLES}
@@ -76,6 +93,7 @@ def values_under(
             for row, columns in zip(multiples, weights, strict=True)
         ]
     efforts = None if actions is None or not features.effort else features.efforts(actions)
+    counts = features.effort_multiples(multiples)
     values = [np.empty((len(states), columns.shape[1])) for columns in weights]
 
     def fill(start: int) -> None:
@@ -85,7 +103,7 @@ def values_under(
             if features.constant:
                 values[number][rows] += features.constant * weights[number][kernel.shape[1]]
             if efforts is not None:
-                values[number][rows] += efforts[rows, None] * weights[number][-1]
+                values[number][rows] += counts[number] * efforts[rows, None] * weights[number][-1]
 
     _for_each(fill, range(0, len(states), ROWS_AT_A_TIME), rows=len(states), functions=len(features.centres))
     return values
@@ -111,7 +129,7 @@ def sums_under(
         discounts = discount ** np.arange(len(trajectory))
         sums[:, i, functions : functions + constant] = features.constant * discounts.sum()  # eq. 1
         if effort:
-            sums[:, i, -1] = discounts @ features.efforts(trajectory.actions)  # eq. 1
+            sums[:, i, -1] = features.effort_multiples(multiples) * (discounts @ features.efforts(trajectory.actions))
         for start in range(0, len(trajectory), ROWS_AT_A_TIME):
             rows = slice(start, start + ROWS_AT_A_TIME)
             for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):

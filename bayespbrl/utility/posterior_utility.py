@@ -29,7 +29,8 @@ class PosteriorUtility:
 
     Attributes:
       features: φ as given.
-      multiples: of its bandwidths, one row for each of C settings, shape (C, S); S = 0 for features without any.
+      multiples: of its bandwidths, one row for each of C settings, shape (C, S); S = 0 for features without any. With
+        a feature of the effort one column more: 1 where it counts, else 0.
       scales: what the differences were divided by under each setting, shape (C,): a draw over it is in the units of φ.
       weights: the utility that is acted on (posterior mean, most likely draw or one draw) is the sum of wᵀφ over the
         settings, in the units of φ, shape (C, D). In a mean each setting's part has its probability in it.
@@ -127,7 +128,8 @@ class PosteriorUtility:
         """Mean and 90 % interval of all that was inferred besides the weights, as plain data.
 
         Of several answerers the lapse rate is that of `next_lapse_rates`, and the side bias is the mean. The weight of
-        the effort is in prior standard deviations.
+        the effort is in prior standard deviations, and 0 where it does not count; `effort counts` is the probability
+        that it does.
         """
         drawn = self.posterior.children["posterior"].dataset
         columns = {"lapse_rate": next_lapse_rates(self.posterior).ravel()} | {
@@ -135,18 +137,22 @@ class PosteriorUtility:
             for name in ("steepness", "tie_threshold", "side_bias")
             if name in drawn
         }
+        lengths, figures = self.multiples, dict[str, Any]()
         if isinstance(self.features, RadialBasis) and self.features.effort:
-            columns["effort"] = drawn["utility_weights"].values[..., -1].ravel() / self.posterior.attrs["prior_scale"]
-        figures: dict[str, Any] = {name: float(values.mean()) for name, values in columns.items()}
+            counts = self.features.effort_multiples(self.multiples)[drawn["setting"].values]
+            weight = counts * drawn["utility_weights"].values[..., -1]
+            columns |= {"effort": weight.ravel() / self.posterior.attrs["prior_scale"]}
+            lengths, figures["effort counts"] = lengths[:, : len(self.features.bandwidths)], float(np.mean(counts > 0))
+        figures |= {name: float(values.mean()) for name, values in columns.items()}
         figures |= {
             f"{name} {'lower' if quantile < 0.5 else 'upper'}": float(np.quantile(values, quantile))
             for name, values in columns.items()
             for quantile in INTERVAL
         }
-        counts = np.bincount(drawn["setting"].values.ravel(), minlength=len(self.scales)) / drawn["setting"].size
+        shares = np.bincount(drawn["setting"].values.ravel(), minlength=len(self.scales)) / drawn["setting"].size
         return figures | {
-            "bandwidth_multiples": np.exp(counts @ np.log(self.multiples)).tolist(),
-            "most probable length scales": float(counts.max()),
+            "bandwidth_multiples": np.exp(shares @ np.log(lengths)).tolist(),
+            "most probable length scales": float(shares.max()),
         }
 
     def _setting(self, number: int) -> StateFeatures:

@@ -64,6 +64,8 @@ def _what_else(found: Mapping[str, Any], settings: int) -> str:
     for name, label in (("tie_threshold", "tie threshold"), ("side_bias", "side bias"), ("effort", effort)):
         text += f", {label}: {inferred(name)}" if name in found else ""
     text += ", with 90 % intervals where they are inferred."
+    if "effort counts" in found:
+        text += f" That effort counts has probability {percent(found['effort counts'])}."
     if settings > 1:
         text += (
             f" The posterior is over {settings} choices of length scales as well; the most probable has "
