@@ -445,7 +445,7 @@ def test_effort_counts_in_half_of_the_settings_and_in_few_dimensions_in_each_wit
         assert len(np.unique(multiples, axis=0)) == 2 * len(without)
     else:
         assert len(multiples) == 27
-        assert all(1 <= np.sum(column == widest) for column in multiples[counts == 0, :-1].T for widest in (1, 3, 9))
+        assert all(np.sum(column == widest) >= 1 for column in multiples[counts == 0, :-1].T for widest in (1, 3, 9))
     np.testing.assert_array_equal(bandwidth_multiples(features, inferred=False, rng=None), np.ones((1, dimensions + 1)))
     assert features.rescaled(multiples[0]).efforts([[1.0, 2.0]]) == 0.0
     assert features.rescaled(multiples[1]).efforts([[1.0, 2.0]]) == pytest.approx(1.4)
