@@ -112,22 +112,22 @@ def radial_basis_under(
         for square, column in zip(squares, multiples.T, strict=True)
     ]
     products, ones = [np.empty_like(square) for square in squares], np.ones(len(points))
-    last = np.zeros(len(squares))
+    kernel, shares, last = products[-1], ones, np.zeros(len(squares))
     for row in multiples:
-        for j in range(int(np.argmax(row != last)), len(row)):  # the products of what comes before are at hand
-            if j == 0:
-                products[0] = factors[0][row[0]]
-            else:
-                np.multiply(products[j - 1], factors[j][row[j]], out=products[j])
-        kernel, last = products[-1], row
-        if not normalised:
-            yield kernel, ones
-            continue
-        totals = kernel @ np.ones(len(centres))
-        if (far := totals < SMALLEST_SUM).any():
-            kernel[far] = radial_basis(points[far], centres, bandwidths * row, period, normalised=True)
-            totals[far] = 1.0
-        yield kernel, 1 / totals
+        if (row != last).any():
+            for j in range(int(np.argmax(row != last)), len(row)):  # the products of what comes before are at hand
+                if j == 0:
+                    products[0] = factors[0][row[0]]
+                else:
+                    np.multiply(products[j - 1], factors[j][row[j]], out=products[j])
+            kernel, last = products[-1], row
+            if normalised:
+                totals = kernel @ np.ones(len(centres))
+                if (far := totals < SMALLEST_SUM).any():
+                    kernel[far] = radial_basis(points[far], centres, bandwidths * row, period, normalised=True)
+                    totals[far] = 1.0
+                shares = 1 / totals
+        yield kernel, shares
 
 
 def _squares(

@@ -430,23 +430,18 @@ def test_all_multiples_of_the_bandwidths_at_once_are_each_alone(normalised, cons
         np.testing.assert_allclose(total, expected, rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.parametrize("dimensions", [1, 2, 3, 5, 8])
-def test_effort_counts_in_half_of_the_settings_and_in_few_dimensions_in_each_with_and_without(dimensions):
+@pytest.mark.parametrize("dimensions", [1, 3, 5, 8])
+def test_effort_counts_in_half_of_the_settings_whatever_the_length_scales(dimensions):
     unlike = RadialBasis(np.zeros((3, dimensions)), np.ones(dimensions), np.full(dimensions, np.inf))
     features = replace(unlike, effort=(0.2, 0.3))
     without, multiples = (
         bandwidth_multiples(each, inferred=True, rng=np.random.default_rng(0)) for each in (unlike, features)
     )
-    np.testing.assert_array_equal(np.unique(multiples[:, :-1], axis=0), without)
     counts = features.effort_multiples(multiples)
-    assert set(counts) == {0.0, 1.0}
-    assert len(multiples) // 2 == counts.sum()
-    if dimensions <= 2:
-        assert len(np.unique(multiples, axis=0)) == 2 * len(without)
-    else:
-        assert len(multiples) == 27
-        assert all(np.sum(column == widest) >= 1 for column in multiples[counts == 0, :-1].T for widest in (1, 3, 9))
-    np.testing.assert_array_equal(bandwidth_multiples(features, inferred=False, rng=None), np.ones((1, dimensions + 1)))
+    for row in (0.0, 1.0):
+        np.testing.assert_array_equal(multiples[counts == row, :-1], without)
+    given = bandwidth_multiples(features, inferred=False, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(given, np.ones((1, dimensions + 1)))
     assert features.rescaled(multiples[0]).efforts([[1.0, 2.0]]) == 0.0
     assert features.rescaled(multiples[1]).efforts([[1.0, 2.0]]) == pytest.approx(1.4)
     # an estimate of an earlier version says nothing of the effort, which then counts

@@ -474,7 +474,15 @@ def test_answers_that_only_effort_explains_are_explained_by_it(method, bandwidth
         assert estimate.quality.pairs_satisfied == len(pairs)
     if method == "posterior-mean":
         assert np.corrcoef(utilities[16:], -efforts[16:])[0, 1] > 0.6  # of walks that nobody judged
-        assert estimate.hyperparameters()["effort counts"] > 0.7 or not bandwidth
+        found = estimate.hyperparameters()
+        assert found["effort counts"] > 0.7
+        assert found["effort upper"] < 0
+        lengths = estimate.multiples[estimate.posterior["posterior"]["setting"].values.ravel(), :-1]
+        np.testing.assert_allclose(found["bandwidth_multiples"], np.exp(np.log(lengths).mean(axis=0)))
+        assert (
+            found["most probable length scales"]
+            >= np.unique(lengths, axis=0, return_counts=True)[1].max() / len(lengths) - 1e-12
+        )
     steps = transitions(walks[:1])
     assert np.sum(estimate.step_utilities(steps)) == pytest.approx(utilities[0])
     # a state alone is worth what a step there without any effort is

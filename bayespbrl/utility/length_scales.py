@@ -31,10 +31,11 @@ def bandwidth_multiples(
 ) -> Float[np.ndarray, "c s"]:
     """Multiples of the bandwidths of φ, one row for each of C settings; one row of ones where nothing is inferred.
 
-    With a feature of the effort there is one column more, by which that is multiplied: 1, or 0 where it does not count.
+    With a feature of the effort there is one column more, by which that is multiplied, and each row occurs twice: with
+    0, where effort does not count, and with 1.
 
-    Decision: it counts in every other setting (of one or two dimensions, in each with and without), because in many
-    tasks it does not, and a few answers about actions at random seem to say that it does (docs/tuning.md).
+    Decision: because in many tasks it does not, and a few answers about actions at random seem to say that it does
+    (docs/tuning.md). Each with and without, because else some length scales would tell whether effort counts.
     """
     dimensions = len(features.bandwidths) if isinstance(features, RadialBasis | DiffusionBasis) else 0
     effort = isinstance(features, RadialBasis) and bool(features.effort)
@@ -43,9 +44,7 @@ def bandwidth_multiples(
     multiples = _length_scales(dimensions, rng)
     if not effort:
         return multiples
-    if 2 * len(multiples) <= MOST_SETTINGS:
-        multiples = np.repeat(multiples, 2, axis=0)
-    return np.column_stack([multiples, np.arange(len(multiples)) % 2])
+    return np.column_stack([np.repeat(multiples, 2, axis=0), np.tile([0.0, 1.0], len(multiples))])
 
 
 def _length_scales(dimensions: int, rng: np.random.Generator) -> Float[np.ndarray, "c s"]:

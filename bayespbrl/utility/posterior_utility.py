@@ -129,7 +129,7 @@ class PosteriorUtility:
 
         Of several answerers the lapse rate is that of `next_lapse_rates`, and the side bias is the mean. The weight of
         the effort is in prior standard deviations, and 0 where it does not count; `effort counts` is the probability
-        that it does.
+        that it does, where that is inferred.
         """
         drawn = self.posterior.children["posterior"].dataset
         columns = {"lapse_rate": next_lapse_rates(self.posterior).ravel()} | {
@@ -137,22 +137,26 @@ class PosteriorUtility:
             for name in ("steepness", "tie_threshold", "side_bias")
             if name in drawn
         }
-        lengths, figures = self.multiples, dict[str, Any]()
+        lengths, told = self.multiples, dict[str, Any]()
+        shares = np.bincount(drawn["setting"].values.ravel(), minlength=len(self.scales)) / drawn["setting"].size
         if isinstance(self.features, RadialBasis) and self.features.effort:
-            counts = self.features.effort_multiples(self.multiples)[drawn["setting"].values]
-            weight = counts * drawn["utility_weights"].values[..., -1]
-            columns |= {"effort": weight.ravel() / self.posterior.attrs["prior_scale"]}
-            lengths, figures["effort counts"] = lengths[:, : len(self.features.bandwidths)], float(np.mean(counts > 0))
-        figures |= {name: float(values.mean()) for name, values in columns.items()}
+            counts = self.features.effort_multiples(self.multiples)
+            weight = counts[drawn["setting"].values] * drawn["utility_weights"].values[..., -1]
+            columns["effort"] = weight.ravel() / self.posterior.attrs["prior_scale"]
+            lengths = lengths[:, : len(self.features.bandwidths)]
+            if np.ptp(counts):
+                told["effort counts"] = float(shares @ counts)
+        figures: dict[str, Any] = {name: float(values.mean()) for name, values in columns.items()}
         figures |= {
             f"{name} {'lower' if quantile < 0.5 else 'upper'}": float(np.quantile(values, quantile))
             for name, values in columns.items()
             for quantile in INTERVAL
         }
-        shares = np.bincount(drawn["setting"].values.ravel(), minlength=len(self.scales)) / drawn["setting"].size
+        _, which = np.unique(lengths, axis=0, return_inverse=True)
         return figures | {
             "bandwidth_multiples": np.exp(shares @ np.log(lengths)).tolist(),
-            "most probable length scales": float(shares.max()),
+            "most probable length scales": float(np.bincount(which.ravel(), weights=shares).max()),
+            **told,
         }
 
     def _setting(self, number: int) -> StateFeatures:

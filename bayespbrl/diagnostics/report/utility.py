@@ -53,7 +53,7 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
 
 
 def _what_else(found: Mapping[str, Any], settings: int) -> str:
-    """What the posterior over `settings` choices of length scales says about all but the weights, in words."""
+    """What the posterior says about all but the weights, in words; `settings` of length scales, and of effort."""
 
     def inferred(name: str) -> str:
         low, high = (found[f"{name} {end}"] for end in ("lower", "upper"))
@@ -65,7 +65,8 @@ def _what_else(found: Mapping[str, Any], settings: int) -> str:
         text += f", {label}: {inferred(name)}" if name in found else ""
     text += ", with 90 % intervals where they are inferred."
     if "effort counts" in found:
-        text += f" That effort counts has probability {percent(found['effort counts'])}."
+        settings //= 2  # each with effort and without
+        text += f" That effort counts has probability {percent(found['effort counts'])}, a priori {percent(0.5)}."
     if settings > 1:
         text += (
             f" The posterior is over {settings} choices of length scales as well; the most probable has "
