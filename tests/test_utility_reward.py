@@ -43,9 +43,13 @@ def test_a_step_earns_the_utility_of_the_next_state_and_tells_the_true_reward(pe
         assert info["utility_deviation"] == pytest.approx(few.std(), rel=1e-5)
 
 
-@pytest.mark.parametrize("utility", ["posterior-mean", "linear-program"])
-def test_a_step_earns_the_utility_of_its_effort_too(tmp_path, utility):
-    run = run_of("Pendulum-v1", tmp_path / "run", effort_utility=True, utility=utility)
+@pytest.mark.parametrize(
+    ("utility", "hyperparameters"),
+    [("posterior-mean", "given"), ("posterior-mean", "inferred"), ("linear-program", "given")],
+)
+def test_a_step_earns_the_utility_of_its_effort_too(tmp_path, utility, hyperparameters):
+    chosen = {"utility": utility, "hyperparameters": hyperparameters}
+    run = run_of("Pendulum-v1", tmp_path / "run", effort_utility=True, **chosen)
     assert len(run.estimate.features.effort) == 1
     wrapped = UtilityReward(gymnasium.make("Pendulum-v1"), run)
     for action in (0.0, 1.5, 7.0):
@@ -61,11 +65,10 @@ def test_a_step_earns_the_utility_of_its_effort_too(tmp_path, utility):
     learner = bayespbrl.resume(tmp_path / "run")
     assert learner.estimate.features.effort == run.estimate.features.effort
     report = run.report("md").read_text()
-    for text in (
-        "weight of the effort of actions, in prior standard deviations: ",
-        "That effort counts has probability",
-    ):
-        assert (text in report) == (utility == "posterior-mean")
+    told = "weight of the effort of actions, in prior standard deviations: " in report
+    assert told == (utility == "posterior-mean")
+    assert ("That effort counts has probability" in report) == (hyperparameters == "inferred")
+    assert ("The posterior is over 27 choices of length scales as well" in report) == (hyperparameters == "inferred")
 
 
 def test_caution_subtracts_standard_deviations(pendulum):
