@@ -135,7 +135,8 @@ class RadialBasisOptions:
         the others give it in the mean. Then how long a trajectory is counts by itself.
       effort: whether φ of a step has one more feature: the mean square of the action's parts, as shares of the largest
         that the space allows, or where it has no bound of their root mean square. An observed one then has a tenth of
-        the prior variance that the functions give a state. Only where actions are continuous.
+        the prior variance that the functions give a state, under settings where effort counts. Only where actions are
+        continuous.
       diffusion: whether φ(s) of discrete states is a `DiffusionBasis` of the observed steps instead of one-hot.
       standardised: whether the one-hot φ(s) of discrete states is divided by how much the number of their visits varies
         between trajectories.
