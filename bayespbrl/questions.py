@@ -144,11 +144,7 @@ def later_questions(
     """
     if options.informative_ties and not preferences.pairs:
         situation = replace(situation, only_ties=preferences.answers)
-    doubted, kept = tuple[int, ...](), tuple[int, ...]()
-    if preferences.pairs and options.left(preferences.answers) > 0:
-        doubted = situation.at_stake() if options.against_kept else situation.doubted()
-    if options.against_kept and options.worthwhile:
-        doubted = tuple(number for number in doubted if situation.told_by(number) >= LEAST_INFORMATION)
+    doubted, kept = _without_noise(situation, options, preferences), tuple[int, ...]()
     if options.against_kept and set(doubted) & set(situation.opponents):
         kept = (situation.opponents[doubted[0]],)
     elif not options.same_start:
@@ -165,6 +161,17 @@ def later_questions(
     worth = not (options.worthwhile and preferences.pairs) or information is None or information >= LEAST_INFORMATION
     wanted = options.within_budget(options.queries_per_iteration, preferences.answers) if worth else 0
     return Chosen(wanted, order, opponents, information)
+
+
+def _without_noise(situation: QuerySituation, options: Questions, preferences: Preferences) -> tuple[int, ...]:
+    """The trajectory without noise, where a question is to be about it whatever the rule; else none."""
+    if not preferences.pairs or options.left(preferences.answers) <= 0:
+        return ()
+    if not options.against_kept:
+        return situation.doubted()
+    if not options.worthwhile:
+        return situation.at_stake()
+    return tuple(number for number in situation.at_stake() if situation.told_by(number) >= LEAST_INFORMATION)
 
 
 def confirmation(situation: QuerySituation, options: Questions, preferences: Preferences) -> Chosen:

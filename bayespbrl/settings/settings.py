@@ -47,7 +47,8 @@ class Features:
         that the utility extends to states far from every compared trajectory, where plain ones fall to zero.
       constant_utility: whether the utility has a constant part, as in `RadialBasisOptions`, where some episodes end
         before the time limit.
-      effort_utility: whether the utility has a part for the effort of continuous actions, as in `RadialBasisOptions`.
+      effort_utility: whether the utility has a part for the effort of continuous actions, as in `RadialBasisOptions`;
+        inferred is then whether it counts, too.
       diffusion_utility: whether the utility of discrete states is smooth over the steps that were observed, with a
         length scale that is inferred, as in `DiffusionBasis`; else it has an independent value for each state. At most
         1000 states.
