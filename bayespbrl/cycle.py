@@ -131,11 +131,8 @@ class Cycle(Collection):
 
         Decision: late, because it still learns: with two answers left in the last four iterations, with one in two.
         """
-        if state.restart is None or state.estimate is None or state.iteration == state.started:
-            return False
         remaining = self.settings.last_iteration(state.started) - state.iteration
-        soon = self.settings.confirmations > 0 and remaining <= 2 * state.left(self.settings)
-        return soon and clearly_better(state.estimate, state.tried, state.restart.tried)
+        return state.nominated and remaining <= 2 * state.left(self.settings)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""
@@ -196,8 +193,11 @@ class Cycle(Collection):
             "hyperparameters": utility.hyperparameters(),
         }
         event = {"check": result, "kept": kept, "bound": asdict(bound), "value": value, "summary": summary}
-        if state.restart is not None and self.settings.confirmations and kept != state.restart.number:
-            event["confirmed"] = True
+        if state.restart is not None and self.settings.confirmations:
+            confirmed = kept != state.restart.number
+            rival = state.tried if confirmed else state.restart.tried
+            marks = {"confirmed": confirmed, "nominated": clearly_better(utility, tried, rival)}
+            event |= {name: True for name, is_so in marks.items() if is_so}
         return _entry(
             {"event": "improved", "iteration": newest, **event},
             trajectories=state.trajectories[-options.trajectories_per_iteration :],

@@ -44,6 +44,7 @@ class LearnerState:
         checked; () where there are none.
       trust: share of the KL bound that the next update may use; it falls after a step back.
       restart: when the policy was started anew, and what was kept by then, or by an answer since; None: it was not.
+      nominated: whether the newest policy, started anew, would replace that one if it were asked about.
       estimate: the last utility estimate; None before the first.
       bound: the last decision on the KL bound; None before the first.
       values: of each iteration's policy, by its number from 1, for reports alone.
@@ -75,6 +76,7 @@ class LearnerState:
     best_tried: tuple[Trajectory, ...] = ()
     trust: float = 1.0
     restart: Restart | None = None
+    nominated: bool = False
     estimate: UtilityEstimate | None = None
     bound: Bound | None = None
     values: tuple[float, ...] = ()
@@ -96,9 +98,13 @@ class LearnerState:
     before: tuple["LearnerState", ...] = field(default=(), repr=False)
 
     def finished(self, settings: Settings) -> bool:
-        """Whether a run with these settings ends here: after an iteration, not within one."""
-        done = (self.iteration, self.preferences.answers, self.unasked)
-        return not self.collected and settings.finished(*done, self.started)
+        """Whether a run with these settings ends here: after an iteration, not within one.
+
+        Decision: not before the nominated policy was asked about, if an answer is left; as often as answers are for it.
+        """
+        done, last = (self.iteration, self.preferences.answers, self.unasked), settings.last_iteration(self.started)
+        waits = self.nominated and self.left(settings) > 0 and self.iteration < last + settings.confirmations
+        return not self.collected and not waits and settings.finished(*done, self.started)
 
     def left(self, settings: Settings) -> float:
         """How many answers the budget of a run with these settings has left; infinity without one."""
