@@ -162,7 +162,7 @@ def _film(learner: Learner, directory: Path) -> str:
 def _run_with_bar(learner: Learner, expert: Expert) -> None:
     console.print("The simulated expert answers according to the hidden reward.")
     with progress_bar() as bar:
-        total, done = learner.settings.most_iterations, learner.state.iteration
+        total, done = learner.settings.with_confirmations, learner.state.iteration
         task = bar.add_task("iterations", total=total, completed=done, state=_state(learner))
         learner.run(
             expert,

@@ -111,7 +111,7 @@ class LearnerState:
         return settings.questions.left(self.preferences.answers)
 
     def in_last_iteration(self, settings: Settings) -> bool:
-        """Whether no iteration follows the one that is begun or about to begin."""
+        """Whether no iteration follows the one that is begun or about to begin, unless a policy is nominated then."""
         return self.iteration + 1 >= settings.last_iteration(self.started)
 
     def restarts(self, settings: Settings) -> bool:

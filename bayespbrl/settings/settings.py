@@ -241,6 +241,11 @@ class Settings:
         return max(most, LAST_ITERATIONS) + self._restarted if self._restarted else most + LAST_ITERATIONS
 
     @property
+    def with_confirmations(self) -> int:
+        """`most_iterations`, and those that a run may add to ask about its restarted policy."""
+        return self.most_iterations + self.confirmations
+
+    @property
     def most_answers(self) -> int:
         """The most answers that a run can use: `answers`, or those of all iterations where they are fewer."""
         asking = self.questions
@@ -269,7 +274,7 @@ class Settings:
         return answers >= budget - self.confirmations or unasked >= MOST_UNASKED or iteration >= last
 
     def last_iteration(self, started: int = 0) -> int:
-        """The last iteration that a run can have; `started` as in `finished`."""
+        """The last iteration, unless a nominated policy is still to be asked about; `started` as in `finished`."""
         return min(self.most_iterations, started + self._restarted) if started else self.most_iterations
 
     def finished(self, iteration: int, answers: int, unasked: int, started: int = 0) -> bool:

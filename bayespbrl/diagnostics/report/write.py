@@ -122,7 +122,7 @@ def _section(name: str, title: str, build: Callable[[], Body], failures: list[Re
 
 
 def _state(contents: RunContents) -> str:
-    done, wanted = len(contents.iterations), contents.settings.most_iterations
+    done, wanted = len(contents.iterations), contents.settings.with_confirmations
     if contents.finished:
         return f"Finished: {done} iterations."
     question = "" if contents.open_question is None else f" Question {contents.open_question} waits for an answer."
