@@ -239,7 +239,7 @@ def test_continuous_actions_have_effort_and_their_policies_are_compared_without_
 @pytest.mark.parametrize(("answers", "left"), [(4, 0), (5, 1), (14, 1), (15, 2), (20, 2), (50, 5)])
 def test_a_tenth_of_the_answers_is_left_for_a_policy_that_is_started_anew(answers, left):
     settings = settings_for("SomebodysEnv-v3", task=TASK, answers=answers)
-    assert settings.confirmations == left
+    assert settings.confirmations == settings.with_confirmations - settings.most_iterations == left
     assert settings.restarts(iteration=5, answers=answers - left, unasked=0)
     assert not settings.restarts(iteration=5, answers=answers - left - 1, unasked=0)
     assert settings_for("SomebodysEnv-v3", task=TASK, answers=answers, iterations=9).confirmations == 0
