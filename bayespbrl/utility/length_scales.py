@@ -121,6 +121,7 @@ def sums_under(
         return [trajectory_features(trajectories, rescaled(features, row), discount=discount) for row in multiples]
     functions = len(features.centres)
     constant, effort = bool(features.constant), bool(features.effort)
+    counts = features.effort_multiples(multiples)
     sums = np.zeros((len(multiples), len(trajectories), functions + constant + effort))
 
     def add(i: int) -> None:
@@ -128,7 +129,7 @@ def sums_under(
         discounts = discount ** np.arange(len(trajectory))
         sums[:, i, functions : functions + constant] = features.constant * discounts.sum()  # eq. 1
         if effort:
-            sums[:, i, -1] = features.effort_multiples(multiples) * (discounts @ features.efforts(trajectory.actions))
+            sums[:, i, -1] = counts * (discounts @ features.efforts(trajectory.actions))  # eq. 1
         for start in range(0, len(trajectory), ROWS_AT_A_TIME):
             rows = slice(start, start + ROWS_AT_A_TIME)
             for number, (kernel, shares) in enumerate(features.under(multiples, trajectory.states[1:][rows])):
