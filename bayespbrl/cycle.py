@@ -18,7 +18,7 @@ from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement.check import Check, checked, clearly_better
+from bayespbrl.improvement.check import POSSIBLY, Check, checked, differences, preferred
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
@@ -127,7 +127,7 @@ class Cycle(Collection):
         return questions.later_questions(self.query_rule, given, options, state.preferences, unasked=state.unasked)
 
     def _nominated(self, state: LearnerState) -> bool:
-        """Whether the restarted policy is to be asked about: the kept one would give way to it.
+        """Whether the restarted policy is to be asked about now: it may be better than the kept one.
 
         Decision: late, because it still learns: with two answers left in the last four iterations, with one in two.
         """
@@ -196,7 +196,7 @@ class Cycle(Collection):
         if state.restart is not None and self.settings.confirmations:
             confirmed = kept != state.restart.number
             rival = state.tried if confirmed else state.restart.tried
-            marks = {"confirmed": confirmed, "nominated": clearly_better(utility, tried, rival)}
+            marks = {"confirmed": confirmed, "nominated": preferred(utility, tried, rival, share=POSSIBLY)}
             event |= {name: True for name, is_so in marks.items() if is_so}
         return _entry(
             {"event": "improved", "iteration": newest, **event},
@@ -206,7 +206,7 @@ class Cycle(Collection):
             estimate=utility,
         )
 
-    def _check(self, state: LearnerState, utility: UtilityEstimate) -> tuple[Check, Float[np.ndarray, " n"] | None]:
+    def _check(self, state: LearnerState, utility: UtilityEstimate) -> tuple[Check, Float[np.ndarray, "s n"] | None]:
         """Whether the newest policy is better than the best before it, now that there are more answers.
 
         With it come the utilities of the better one's trajectories; None of the first policy, which is not tried. What
@@ -214,19 +214,25 @@ class Cycle(Collection):
         """
         if state.iteration == state.started:
             return Check(state.iteration, state.trust), None
-        newest = utility.trajectory_utilities(state.tried or self._tried(state.policy))
+        newest = self._judged(utility, state.tried or self._tried(state.policy))
         if state.best == state.started:
             return Check(state.iteration, state.trust), newest
-        best = utility.trajectory_utilities(state.best_tried or self._tried(state.best_policy))
-        check = checked(newest - best, newest=state.iteration, best=state.best, trust=state.trust)
+        best = self._judged(utility, state.best_tried or self._tried(state.best_policy))
+        check = checked(differences(newest, best), newest=state.iteration, best=state.best, trust=state.trust)
         return check, newest if check.best == state.iteration else best
+
+    def _judged(self, utility: UtilityEstimate, tried: Sequence[Trajectory]) -> Float[np.ndarray, "s n"]:
+        """Utilities of a policy's trajectories: under each draw where policies are compared, else in the mean."""
+        if self.settings.questions.against_kept:
+            return utility.trajectory_draws(tried)
+        return utility.trajectory_utilities(tried)[None]
 
     def _kept(
         self,
         state: LearnerState,
         utility: UtilityEstimate,
         check: Check | None,
-        of_best: Float[np.ndarray, " n"] | None,
+        of_best: Float[np.ndarray, "s n"] | None,
         tried: tuple[Trajectory, ...],
     ) -> int:
         """The number of the policy that the run keeps now, by the trajectories `tried` of the newest, and of others.
@@ -236,18 +242,18 @@ class Cycle(Collection):
         newest = state.iteration + 1
         if check is None:
             return newest
-        better = of_best is None or (utility.trajectory_utilities(tried) - of_best).mean() > 0
+        better = of_best is None or differences(self._judged(utility, tried), of_best).mean() > 0
         kept = newest if better else check.best
         if state.restart is None:
             return kept
         if self.settings.confirmations:
             answered = {past.newcomer for past in state.past if past.answer is not Answer.SKIP}
             asked = state.iteration > state.started and len(state.trajectories) - 1 in answered
-            confirmed = asked and clearly_better(utility, state.tried, state.restart.tried)
+            confirmed = asked and preferred(utility, state.tried, state.restart.tried)
             return state.iteration if confirmed else state.restart.number
         if not better:
             tried = state.tried if check.best == state.iteration else state.best_tried
-        return kept if clearly_better(utility, tried, state.restart.tried) else state.restart.number
+        return kept if preferred(utility, tried, state.restart.tried) else state.restart.number
 
     def estimate(self, state: LearnerState) -> UtilityEstimate:
         """Step 1, the utility from all answers so far."""

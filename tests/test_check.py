@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayespbrl.improvement.check import LEAST_TRUST, Check, checked, clearly_better
+from bayespbrl.improvement.check import LEAST_TRUST, Check, checked, differences, preferred
 
 NOISE = np.array([-1.0, 1.0, -0.5, 0.5])
 
@@ -32,6 +32,13 @@ def test_equal_trajectories_change_nothing():
     assert checked(np.zeros(4), newest=7, best=3, trust=0.5) == Check(3, 0.5)
 
 
+def test_most_draws_decide_and_not_a_few_of_large_utilities():
+    newest = np.array([[50.0, 50.0], [-1.0, -1.0], [-1.0, -2.0]])  # three draws, two starts
+    assert np.mean(newest) > 0
+    np.testing.assert_array_equal(differences(newest, np.zeros((3, 2))), [-1, -1])
+    np.testing.assert_array_equal(differences(newest[:1], np.ones((1, 2))), [49, 49])  # the mean alone
+
+
 class Posterior:
     """Draws of a utility, and their mean, whatever the trajectories; a trajectory is its own row of draws."""
 
@@ -48,11 +55,11 @@ class Posterior:
 def test_a_policy_nobody_is_asked_about_has_to_be_better_by_three_in_four_draws(worse, expected):
     draws = np.r_[np.full(worse, -1.0), np.full(8 - worse, 100.0)]
     tried = [draws + 2.0, draws - 2.0]  # two starts, of which the mean counts
-    assert clearly_better(Posterior(), tried, np.zeros((2, 8))) == expected
+    assert preferred(Posterior(), tried, np.zeros((2, 8))) == expected
 
 
 def test_without_a_posterior_the_estimate_decides():
     estimate = Posterior()
     estimate.posterior = None
-    assert clearly_better(estimate, [np.r_[-1.0, -1.0, 3.0]], np.zeros((1, 3)))
-    assert not clearly_better(estimate, np.zeros((1, 3)), np.zeros((1, 3)))
+    assert preferred(estimate, [np.r_[-1.0, -1.0, 3.0]], np.zeros((1, 3)))
+    assert not preferred(estimate, np.zeros((1, 3)), np.zeros((1, 3)))

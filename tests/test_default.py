@@ -17,7 +17,7 @@ import bayespbrl
 from bayespbrl import Learner, ReturnExpert, collection, cycle, rollouts
 from bayespbrl.envs import opening
 from bayespbrl.events import answered
-from bayespbrl.improvement.check import Check
+from bayespbrl.improvement.check import Check, differences
 from bayespbrl.policies import greedy
 from bayespbrl.rollouts import rollout
 from bayespbrl.runs.actor import Actor
@@ -163,8 +163,9 @@ def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
 def test_after_a_restart_the_kept_policy_gives_way_only_to_a_clearly_better_one(restarted):
     state, cycle_ = restarted.learner.state, restarted.learner.cycle
     tried, check = state.tried, Check(state.best, 1.0)
-    of_best = state.estimate.trajectory_utilities(state.best_tried)
-    same = tried if check.best == state.iteration else state.best_tried
+    of_best = cycle_._judged(state.estimate, state.best_tried)
+    better = differences(cycle_._judged(state.estimate, tried), of_best).mean() > 0
+    same = tried if better else state.best_tried
     for kept, expected in ((same, False), (worst_first(state, tried), True)):
         before = replace(state, restart=replace(state.restart, tried=kept))
         number = cycle_._kept(before, state.estimate, check, of_best, tried)
@@ -181,7 +182,7 @@ def test_after_a_restart_the_best_policy_is_judged_by_its_own_trajectories(resta
     restart = replace(state.restart, tried=tuple(state.trajectories[: len(bad)]))
     of_the_two = {"tried": good, "best_tried": bad} if newest else {"tried": bad, "best_tried": good}
     check = Check(state.iteration if newest else state.best, 1.0)
-    of_best = state.estimate.trajectory_utilities(good)
+    of_best = cycle_._judged(state.estimate, good)
     kept = cycle_._kept(replace(state, restart=restart, **of_the_two), state.estimate, check, of_best, bad)
     assert kept == check.best
 
@@ -213,7 +214,7 @@ def test_a_restarted_run_that_was_stopped_or_undone_goes_on_bit_for_bit(restarte
     assert finished.state.kept == restarted.learner.state.kept
 
 
-@pytest.mark.parametrize("seed", [8, 11])
+@pytest.mark.parametrize("seed", [8, 9])
 def test_policies_are_compared_without_noise_and_a_restarted_one_before_it_is_kept(seed):
     sizes = FAST | {"answers": 10, "restart_iterations": 8, "worthwhile": False, "seed": seed}
     run, expert, log, duels = Learner(Slope(), **sizes), ReturnExpert(), Memory(), []

@@ -11,7 +11,7 @@ Resuming a run, undoing an answer and reporting on a run in progress all use thi
   `session`, which the answers of a sitting share, and `replays`, how often the clips began again;
 * `improved`: a new estimate and a new policy (steps 1 and 2), which end an iteration: the `check` of the policy before
   it, the number of the policy that is `kept`, `confirmed` where an answer made a restarted one that, `nominated` where
-  an answer about the new policy would make it that, the decision on the KL `bound`, the `value` of the new policy, and
+  the new policy may be better than that one, the decision on the KL `bound`, the `value` of the new policy, and
   the `summary` for reports, which the learner never reads;
 * `undone`: the last answer and everything after it is taken back, by `answerer`, where known.
 

@@ -44,7 +44,7 @@ class LearnerState:
         checked; () where there are none.
       trust: share of the KL bound that the next update may use; it falls after a step back.
       restart: when the policy was started anew, and what was kept by then, or by an answer since; None: it was not.
-      nominated: whether the newest policy, started anew, would replace that one if it were asked about.
+      nominated: whether the newest policy, started anew, is to be asked about, because it may be better than that one.
       estimate: the last utility estimate; None before the first.
       bound: the last decision on the KL bound; None before the first.
       values: of each iteration's policy, by its number from 1, for reports alone.

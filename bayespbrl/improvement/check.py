@@ -15,7 +15,8 @@ from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
 
 LEAST_TRUST = 0.05
-CLEARLY = 0.75  # share of the posterior's draws
+# Shares of the posterior's draws. Decision: a quarter is enough to ask; three quarters are to keep.
+CLEARLY, POSSIBLY = 0.75, 0.25
 STANDARD_ERRORS = 1.0  # by which the newest policy has to be worse for a step back
 
 
@@ -37,6 +38,15 @@ class Check:
     standard_error: float = 0.0
 
 
+def differences(newest: Float[np.ndarray, "s n"], best: Float[np.ndarray, "s n"]) -> Float[np.ndarray, " n"]:
+    """By how much one policy's trajectories are better than another's from the same starts: of S draws the median.
+
+    Decision: not the mean. Draws have no common scale, and a few of large utilities may turn it against an answer that
+    most draws follow (docs/tuning.md).
+    """
+    return np.asarray(np.median(newest - best, axis=0))
+
+
 def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, trust: float) -> Check:
     """The check of one update.
 
@@ -54,13 +64,14 @@ def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, tru
     return Check(best, trust, False, gain, error)
 
 
-def clearly_better(utility: UtilityEstimate, tried: Sequence[Trajectory], kept: Sequence[Trajectory]) -> bool:
-    """Whether a restarted policy, about which hardly any question was asked, replaces the kept one.
+def preferred(
+    utility: UtilityEstimate, tried: Sequence[Trajectory], kept: Sequence[Trajectory], *, share: float = CLEARLY
+) -> bool:
+    """Whether at least this share of the draws prefers a restarted policy's trajectories to the kept one's.
 
-    It does where `CLEARLY` of the draws prefer its trajectories to the kept policy's from the same starts; without a
-    posterior, where the estimate does.
+    From the same starts; without a posterior, whether the estimate does.
     """
     if utility.posterior is None:
         return bool((utility.trajectory_utilities(tried) - utility.trajectory_utilities(kept)).mean() > 0)
     gains = (utility.trajectory_draws(tried) - utility.trajectory_draws(kept)).mean(axis=1)
-    return bool(np.mean(gains > 0) >= CLEARLY)
+    return bool(np.mean(gains > 0) >= share)
