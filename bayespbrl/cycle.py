@@ -18,7 +18,7 @@ from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement.check import POSSIBLY, Check, checked, differences, preferred
+from bayespbrl.improvement.check import CLEARLY, POSSIBLY, Check, checked, differences, preferred, share_better
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
@@ -242,7 +242,7 @@ class Cycle(Collection):
         newest = state.iteration + 1
         if check is None:
             return newest
-        better = of_best is None or differences(self._judged(utility, tried), of_best).mean() > 0
+        better = of_best is None or share_better(self._judged(utility, tried), of_best) >= CLEARLY
         kept = newest if better else check.best
         if state.restart is None:
             return kept

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayespbrl.improvement.check import LEAST_TRUST, Check, checked, differences, preferred
+from bayespbrl.improvement.check import LEAST_TRUST, Check, checked, differences, preferred, share_better
 
 NOISE = np.array([-1.0, 1.0, -0.5, 0.5])
 
@@ -37,6 +37,11 @@ def test_most_draws_decide_and_not_a_few_of_large_utilities():
     assert np.mean(newest) > 0
     np.testing.assert_array_equal(differences(newest, np.zeros((3, 2))), [-1, -1])
     np.testing.assert_array_equal(differences(newest[:1], np.ones((1, 2))), [49, 49])  # the mean alone
+
+
+@pytest.mark.parametrize(("newest", "share"), [([[3, -1]], 1), ([[1, -1]], 0), ([[9, 9], [-1, 0], [2, -1]], 2 / 3)])
+def test_a_draw_prefers_what_is_better_in_the_mean_over_the_starts(newest, share):
+    assert share_better(np.array(newest, dtype=float), np.zeros((len(newest), 2))) == share
 
 
 class Posterior:

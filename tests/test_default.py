@@ -17,7 +17,7 @@ import bayespbrl
 from bayespbrl import Learner, ReturnExpert, collection, cycle, rollouts
 from bayespbrl.envs import opening
 from bayespbrl.events import answered
-from bayespbrl.improvement.check import Check, differences
+from bayespbrl.improvement.check import CLEARLY, Check, share_better
 from bayespbrl.policies import greedy
 from bayespbrl.rollouts import rollout
 from bayespbrl.runs.actor import Actor
@@ -164,7 +164,7 @@ def test_after_a_restart_the_kept_policy_gives_way_only_to_a_clearly_better_one(
     state, cycle_ = restarted.learner.state, restarted.learner.cycle
     tried, check = state.tried, Check(state.best, 1.0)
     of_best = cycle_._judged(state.estimate, state.best_tried)
-    better = differences(cycle_._judged(state.estimate, tried), of_best).mean() > 0
+    better = share_better(cycle_._judged(state.estimate, tried), of_best) >= CLEARLY
     same = tried if better else state.best_tried
     for kept, expected in ((same, False), (worst_first(state, tried), True)):
         before = replace(state, restart=replace(state.restart, tried=kept))

@@ -15,7 +15,7 @@ from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility.estimate import UtilityEstimate
 
 LEAST_TRUST = 0.05
-# Shares of the posterior's draws. Decision: a quarter is enough to ask; three quarters are to keep.
+# Shares of the posterior's draws. Decision: a quarter is enough to ask, and three quarters to keep.
 CLEARLY, POSSIBLY = 0.75, 0.25
 STANDARD_ERRORS = 1.0  # by which the newest policy has to be worse for a step back
 
@@ -47,6 +47,11 @@ def differences(newest: Float[np.ndarray, "s n"], best: Float[np.ndarray, "s n"]
     return np.asarray(np.median(newest - best, axis=0))
 
 
+def share_better(newest: Float[np.ndarray, "s n"], best: Float[np.ndarray, "s n"]) -> float:
+    """Share of the draws under which one policy's trajectories are better in the mean than another's."""
+    return float(np.mean((newest - best).mean(axis=1) > 0))
+
+
 def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, trust: float) -> Check:
     """The check of one update.
 
@@ -73,5 +78,4 @@ def preferred(
     """
     if utility.posterior is None:
         return bool((utility.trajectory_utilities(tried) - utility.trajectory_utilities(kept)).mean() > 0)
-    gains = (utility.trajectory_draws(tried) - utility.trajectory_draws(kept)).mean(axis=1)
-    return bool(np.mean(gains > 0) >= share)
+    return share_better(utility.trajectory_draws(tried), utility.trajectory_draws(kept)) >= share
