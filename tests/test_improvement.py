@@ -197,25 +197,6 @@ def test_q_is_the_same_however_many_transitions_are_taken_at_a_time(monkeypatch,
     np.testing.assert_allclose(in_blocks, at_once, atol=1e-6)
 
 
-@pytest.mark.parametrize("noise_free", [False, True])
-def test_q_of_a_policy_without_its_noise_has_none_of_what_the_noise_earns(noise_free):
-    # each step is worth a²: Q(s, a) = a² + γσ²/(1 − γ), without the noise of N(0, σ²) a²
-    rng, space = np.random.default_rng(0), Box(-100, 100, (1,))
-    policy = LinearGaussianPolicy.initial(Box(-9, 9, (1,)), space, initial_scale=0.01)
-    states, actions = rng.normal(size=(4001, 1)), rng.normal(size=(4000, 1))
-    steps = transitions([Trajectory(states, actions, np.zeros(4000), terminated=False)])
-    q = q_function.estimate_q(
-        policy,
-        q_function.CriticData(steps, actions[:, 0] ** 2),
-        key=jax.random.key(1),
-        action_space=space,
-        features=lambda _, taken: taken**2,
-        critic=replace(CRITIC, noise_free_critic=noise_free),
-    )
-    earned = 0 if noise_free else DISCOUNT / (1 - DISCOUNT) * policy.action_standard_deviation(states[:1])[0, 0] ** 2
-    np.testing.assert_allclose(q(states[:2], np.array([[0.0], [3.0]])), [earned, earned + 9], rtol=0.1, atol=1e-6)
-
-
 def test_nothing_follows_a_terminal_state():
     # 0 → 1 → terminal 2, each step worth 1: Q(1, ·) = 1, Q(0, ·) = 1 + γ.
     trajectory = Trajectory(np.array([0, 1, 2]), np.array([0, 0]), np.zeros(2), terminated=True)

@@ -55,7 +55,6 @@ BAD = {
     "standardised_utility": [None, 1, "yes"],
     "informative_ties": [None, 1, "yes"],
     "noise_free": [None, 1, "yes"],
-    "noise_free_critic": [None, 1, "yes"],
     "against_kept": [None, 1, "yes"],
     "preset": ["fast", "", None],
     "answers": [0, -1, 2.5, True],
@@ -223,9 +222,7 @@ def test_where_states_are_discrete_goals_may_be_rare():
 def test_continuous_actions_have_effort_and_their_policies_are_compared_without_noise():
     def options(env="SomebodysEnv-v3", **chosen):
         settings = settings_for(env, task=TASK, **chosen)
-        effort, checked = settings.features.effort_utility, settings.update.checked
-        assert settings.critic.noise_free_critic == (effort and checked)
-        return effort, settings.rollouts.noise_free, settings.questions.against_kept
+        return settings.features.effort_utility, settings.rollouts.noise_free, settings.questions.against_kept
 
     assert options() == (True, True, True)
     assert options(expert="page") == (False, False, False)  # people see states, and would wait

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Key, Shaped
 from bayespbrl import checks
 from bayespbrl.features import StateActionFeatures
 from bayespbrl.improvement.lstd import Targets, TransitionSums, solve_lstd, transition_sums
-from bayespbrl.policies import Policy, Sampler, clipped, greedy, is_discrete, sample_actions
+from bayespbrl.policies import Policy, clipped, is_discrete, sample_actions
 from bayespbrl.policies.policy import DiscretePolicy
 from bayespbrl.trajectories import DISCOUNT, Transitions
 
@@ -29,25 +29,16 @@ class Critic:
     Attributes:
       discount: γ in [0, 1).
       fixed_point_ridge, projection_ridge: LSTD's penalties β₁, β₂ ≥ 0.
-      noise_free_critic: whether Q is that of a continuous policy without its noise, which is what a run with checks
-        keeps. With it, a policy that stands still is good where its noise alone reaches the goal.
     """
 
     discount: float = DISCOUNT
     fixed_point_ridge: float = 1e-8
     projection_ridge: float = 1e-8
-    noise_free_critic: bool = False
 
     def __post_init__(self) -> None:
         checks.share("discount", self.discount, below_one=True)
         checks.non_negative("fixed_point_ridge", self.fixed_point_ridge)
         checks.non_negative("projection_ridge", self.projection_ridge)
-        checks.boolean("noise_free_critic", self.noise_free_critic)
-
-    def solve(self, sums: TransitionSums) -> Targets:
-        """θ by `solve_lstd`."""
-        ridges = {"fixed_point_ridge": self.fixed_point_ridge, "projection_ridge": self.projection_ridge}
-        return solve_lstd(sums, discount=self.discount, **ridges)
 
 
 @dataclass(frozen=True)
@@ -113,7 +104,7 @@ def estimate_q(
     """LSTD-Q (Lagoudakis & Parr 2003) with a bias column (paper, step 2), from every given transition.
 
     Args:
-      policy: whose Q; without its noise with `noise_free_critic`.
+      policy: whose Q.
       data: transitions and their utilities.
       key: for the fresh action in each next state, where actions cannot be enumerated.
       action_space: bounds the fresh actions.
@@ -121,17 +112,14 @@ def estimate_q(
       critic: LSTD's options.
     """
     steps = data.steps
-    following = None
-    if not is_discrete(policy):
-        continued: Sampler = greedy(policy) if critic.noise_free_critic else policy
-        following = clipped(sample_actions(continued, key, steps.next_states), action_space)
+    following = None if is_discrete(policy) else clipped(sample_actions(policy, key, steps.next_states), action_space)
     parts = np.zeros(len(steps), int) if data.quarters is None else data.quarters
     sums = [_sums(policy, data, following, features, np.flatnonzero(parts == part)) for part in np.unique(parts)]
-    weights = critic.solve(reduce(add, sums))
+    weights = solve_lstd(reduce(add, sums), **vars(critic))
     if len(sums) == 1:
         return QFunction(features, weights)
     first = [replace(part, target=part.target.reshape(len(part.gram), -1)[:, 0]) for part in sums]
-    halves = [critic.solve(reduce(add, half)) for half in chain.from_iterable(halvings(first))]
+    halves = [solve_lstd(reduce(add, half), **vars(critic)) for half in chain.from_iterable(halvings(first))]
     return QFunction(features, weights, np.reshape(halves, (-1, 2, len(weights))).T)
 
 

@@ -94,7 +94,7 @@ TASKS = {
 TASKS["gridworld"] |= dict.fromkeys(("standardised_utility", "informative_ties", "noise_free"), False)
 TASKS["gridworld"] |= {"critic_iterations": 4}
 # So are those of the two with continuous actions.
-WITHOUT_EFFORT = dict.fromkeys(("effort_utility", "noise_free", "against_kept", "noise_free_critic"), False)
+WITHOUT_EFFORT = dict.fromkeys(("effort_utility", "noise_free", "against_kept"), False)
 TASKS["swing-up"] |= WITHOUT_EFFORT
 TASKS["bicycle"] |= WITHOUT_EFFORT
 # An environment object of the user's is known by its gymnasium id.
@@ -155,8 +155,7 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
         for measured in measured_options(env, chosen):
             options |= MEASURED[measured](task)
     if not chosen.get("checked", True):
-        for name in ("noise_free", "noise_free_critic"):  # such a run keeps the newest policy, with its noise
-            options.pop(name, None)
+        options.pop("noise_free", None)  # such a run keeps the newest policy, with its noise
     if chosen.get("diffusion_utility"):
         options.pop("standardised_utility", None)  # the other kind of features of discrete states
     if people:

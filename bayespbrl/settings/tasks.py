@@ -58,14 +58,13 @@ class Task:
         goals may be rare: one that few trajectories reach counts as much, and ties tell of it. Without its noise it may
         stay somewhere for good, which trajectories with it do not show. Continuous actions may cost something by
         themselves, and with them a policy that hardly acts may seem good, which duels of policies without noise rule
-        out; Q is of such policies too, because noise alone may reach a goal. People see states rather than actions,
-        and would wait for the last duels.
+        out; people see states rather than actions, and would wait for the last duels.
         """
         continuous = isinstance(self.action_space, Box)
         dimensions = self.observation_space.shape[0] if isinstance(self.observation_space, Box) else 0
         of_a_table = {"restart_iterations": 0, "critic_iterations": None, "noise_free": True}
         of_rare_goals = {"standardised_utility": True, "informative_ties": True}
-        of_effort = {"effort_utility": True, "noise_free": True, "against_kept": True, "noise_free_critic": True}
+        of_effort = {"effort_utility": True, "noise_free": True, "against_kept": True}
         special = {} if dimensions else of_a_table | of_rare_goals
         if continuous and not people:
             special = special | of_effort
