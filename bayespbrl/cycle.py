@@ -18,7 +18,7 @@ from bayespbrl.events import Entry, LearnerState
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement.check import CLEARLY, POSSIBLY, Check, checked, differences, preferred, share_better
+from bayespbrl.improvement.check import CLEARLY, POSSIBLY, Check, checked, median_differences, preferred, share_better
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
@@ -218,7 +218,7 @@ class Cycle(Collection):
         if state.best == state.started:
             return Check(state.iteration, state.trust), newest
         best = self._judged(utility, state.best_tried or self._tried(state.best_policy))
-        check = checked(differences(newest, best), newest=state.iteration, best=state.best, trust=state.trust)
+        check = checked(median_differences(newest, best), newest=state.iteration, best=state.best, trust=state.trust)
         return check, newest if check.best == state.iteration else best
 
     def _judged(self, utility: UtilityEstimate, tried: Sequence[Trajectory]) -> Float[np.ndarray, "s n"]:

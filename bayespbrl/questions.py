@@ -39,7 +39,9 @@ class Questions:
       worthwhile: whether a question is left out whose answer is expected to tell less than `LEAST_INFORMATION`.
       against_kept: whether a policy without its noise (`noise_free`) is compared with the one that is kept, without its
         noise too. The best trajectory so far is a lucky one: a loss against it says little about which of two policies
-        is better. A tenth of the answers is then left for a restarted policy, which is asked about before it is kept.
+        is better. Which of two policies is better is then what most draws say, and not their mean; the newest is kept
+        where three quarters say so. A tenth of the answers is left for a restarted policy, which is asked about,
+        wherever a quarter prefer it, before it is kept.
       clip_steps: length of the part of each trajectory, drawn at random, that questions are about; None: all of it. A
         person sees a part in seconds.
       repeats: share of the questions that are an earlier one with sides swapped. They are for people: the answers tell

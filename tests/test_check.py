@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from bayespbrl.improvement.check import LEAST_TRUST, Check, checked, differences, preferred, share_better
+from bayespbrl.improvement.check import (
+    LEAST_TRUST,
+    POSSIBLY,
+    Check,
+    checked,
+    median_differences,
+    preferred,
+    share_better,
+)
 
 NOISE = np.array([-1.0, 1.0, -0.5, 0.5])
 
@@ -35,8 +43,8 @@ def test_equal_trajectories_change_nothing():
 def test_most_draws_decide_and_not_a_few_of_large_utilities():
     newest = np.array([[50.0, 50.0], [-1.0, -1.0], [-1.0, -2.0]])  # three draws, two starts
     assert np.mean(newest) > 0
-    np.testing.assert_array_equal(differences(newest, np.zeros((3, 2))), [-1, -1])
-    np.testing.assert_array_equal(differences(newest[:1], np.ones((1, 2))), [49, 49])  # the mean alone
+    np.testing.assert_array_equal(median_differences(newest, np.zeros((3, 2))), [-1, -1])
+    np.testing.assert_array_equal(median_differences(newest[:1], np.ones((1, 2))), [49, 49])  # the mean alone
 
 
 @pytest.mark.parametrize(("newest", "share"), [([[3, -1]], 1), ([[1, -1]], 0), ([[9, 9], [-1, 0], [2, -1]], 2 / 3)])
@@ -56,11 +64,15 @@ class Posterior:
         return np.mean(trajectories, axis=1)
 
 
-@pytest.mark.parametrize(("worse", "expected"), [(0, True), (2, True), (3, False), (8, False)])
-def test_a_policy_nobody_is_asked_about_has_to_be_better_by_three_in_four_draws(worse, expected):
+@pytest.mark.parametrize(
+    ("worse", "kept", "asked_about"),
+    [(0, True, True), (2, True, True), (3, False, True), (6, False, True), (7,) + 2 * (False,)],
+)
+def test_three_in_four_draws_keep_a_policy_and_one_in_four_asks_about_it(worse, kept, asked_about):
     draws = np.r_[np.full(worse, -1.0), np.full(8 - worse, 100.0)]
     tried = [draws + 2.0, draws - 2.0]  # two starts, of which the mean counts
-    assert preferred(Posterior(), tried, np.zeros((2, 8))) == expected
+    assert preferred(Posterior(), tried, np.zeros((2, 8))) == kept
+    assert preferred(Posterior(), tried, np.zeros((2, 8)), share=POSSIBLY) == asked_about
 
 
 def test_without_a_posterior_the_estimate_decides():

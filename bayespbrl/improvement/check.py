@@ -38,7 +38,7 @@ class Check:
     standard_error: float = 0.0
 
 
-def differences(newest: Float[np.ndarray, "s n"], best: Float[np.ndarray, "s n"]) -> Float[np.ndarray, " n"]:
+def median_differences(newest: Float[np.ndarray, "s n"], best: Float[np.ndarray, "s n"]) -> Float[np.ndarray, " n"]:
     """By how much one policy's trajectories are better than another's from the same starts: of S draws the median.
 
     Decision: not the mean. Draws have no common scale, and a few of large utilities may turn it against an answer that
