@@ -14,11 +14,11 @@ from jaxtyping import Float
 from bayespbrl import events, queries, questions
 from bayespbrl.collection import CHOOSE, CLIPS, FEATURES, FIT, IMPROVE, REPEAT, SHOW, VISITED, Collection
 from bayespbrl.envs.stepping import step_limit
-from bayespbrl.events import Entry, LearnerState
+from bayespbrl.events import Entry, LearnerState, Restart
 from bayespbrl.experts import SIMULATED
 from bayespbrl.features import FeatureSource
 from bayespbrl.improvement import schedules
-from bayespbrl.improvement.check import CLEARLY, POSSIBLY, Check, checked, median_differences, preferred, share_better
+from bayespbrl.improvement.check import CLEARLY, POSSIBLY, Check, checked, judged, median_differences, share_better
 from bayespbrl.improvement.problem import UpdateProblem, quarters, recent, states_of_update, step_utilities
 from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
@@ -170,7 +170,10 @@ class Cycle(Collection):
         check, of_best = self._check(state, utility) if self.settings.update.checked else (None, None)
         improved, bound = self.update(state, utility, check)
         tried, newest = self._tried(improved.policy), state.iteration + 1
-        kept = self._kept(state, utility, check, of_best, tried)
+        if state.restart is not None and self.settings.confirmations:
+            kept, marks = self._confirmed(state, state.restart, utility, tried)
+        else:
+            kept, marks = self._kept(state, utility, check, of_best, tried), {}
         clock.append(time.perf_counter())
         evaluated = self.evaluated(improved.policy if check is None else greedy(improved.policy))
         value = float(evaluated.total.mean())
@@ -192,12 +195,7 @@ class Cycle(Collection):
             "schedule": bound.summary(),
             "hyperparameters": utility.hyperparameters(),
         }
-        event = {"check": result, "kept": kept, "bound": asdict(bound), "value": value, "summary": summary}
-        if state.restart is not None and self.settings.confirmations:
-            confirmed = kept != state.restart.number
-            rival = state.tried if confirmed else state.restart.tried
-            marks = {"confirmed": confirmed, "nominated": preferred(utility, tried, rival, share=POSSIBLY)}
-            event |= {name: True for name, is_so in marks.items() if is_so}
+        event = {"check": result, "kept": kept, "bound": asdict(bound), "value": value, "summary": summary, **marks}
         return _entry(
             {"event": "improved", "iteration": newest, **event},
             trajectories=state.trajectories[-options.trajectories_per_iteration :],
@@ -223,9 +221,7 @@ class Cycle(Collection):
 
     def _judged(self, utility: UtilityEstimate, tried: Sequence[Trajectory]) -> Float[np.ndarray, "s n"]:
         """Utilities of a policy's trajectories: under each draw where policies are compared, else in the mean."""
-        if self.settings.questions.against_kept:
-            return utility.trajectory_draws(tried)
-        return utility.trajectory_utilities(tried)[None]
+        return judged(utility, tried, by_draws=self.settings.questions.against_kept)
 
     def _kept(
         self,
@@ -235,10 +231,7 @@ class Cycle(Collection):
         of_best: Float[np.ndarray, "s n"] | None,
         tried: tuple[Trajectory, ...],
     ) -> int:
-        """The number of the policy that the run keeps now, by the trajectories `tried` of the newest, and of others.
-
-        Where answers are left for a restarted policy, it is kept once it was asked about and still is clearly better.
-        """
+        """The number of the policy that the run keeps now, by the trajectories `tried` of the newest, and of others."""
         newest = state.iteration + 1
         if check is None:
             return newest
@@ -246,14 +239,27 @@ class Cycle(Collection):
         kept = newest if better else check.best
         if state.restart is None:
             return kept
-        if self.settings.confirmations:
-            answered = {past.newcomer for past in state.past if past.answer is not Answer.SKIP}
-            asked = state.iteration > state.started and len(state.trajectories) - 1 in answered
-            confirmed = asked and preferred(utility, state.tried, state.restart.tried)
-            return state.iteration if confirmed else state.restart.number
         if not better:
             tried = state.tried if check.best == state.iteration else state.best_tried
-        return kept if preferred(utility, tried, state.restart.tried) else state.restart.number
+        clearly = share_better(judged(utility, tried), judged(utility, state.restart.tried)) >= CLEARLY
+        return kept if clearly else state.restart.number
+
+    def _confirmed(
+        self, state: LearnerState, restart: Restart, utility: UtilityEstimate, tried: tuple[Trajectory, ...]
+    ) -> tuple[int, dict[str, bool]]:
+        """As `_kept` where answers are left for a restarted policy, and the marks of the event: of those that hold.
+
+        It is kept once it was asked about and still is clearly better. The newest is to be asked about if it may be.
+        """
+        answered = {past.newcomer for past in state.past if past.answer is not Answer.SKIP}
+        asked = state.iteration > state.started and len(state.trajectories) - 1 in answered
+        kept, rival = restart.number, judged(utility, restart.tried)
+        marks = {}
+        if asked and share_better(of_asked := judged(utility, state.tried), rival) >= CLEARLY:
+            kept, rival, marks["confirmed"] = state.iteration, of_asked, True
+        if share_better(judged(utility, tried), rival) >= POSSIBLY:
+            marks["nominated"] = True
+        return kept, marks
 
     def estimate(self, state: LearnerState) -> UtilityEstimate:
         """Step 1, the utility from all answers so far."""

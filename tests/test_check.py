@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from bayespbrl.improvement.check import (
+    CLEARLY,
     LEAST_TRUST,
     POSSIBLY,
     Check,
     checked,
+    judged,
     median_differences,
-    preferred,
     share_better,
 )
 
@@ -71,12 +72,16 @@ class Posterior:
 def test_three_in_four_draws_keep_a_policy_and_one_in_four_asks_about_it(worse, kept, asked_about):
     draws = np.r_[np.full(worse, -1.0), np.full(8 - worse, 100.0)]
     tried = [draws + 2.0, draws - 2.0]  # two starts, of which the mean counts
-    assert preferred(Posterior(), tried, np.zeros((2, 8))) == kept
-    assert preferred(Posterior(), tried, np.zeros((2, 8)), share=POSSIBLY) == asked_about
+    share = share_better(judged(Posterior(), tried), judged(Posterior(), np.zeros((2, 8))))
+    assert (share >= CLEARLY) == kept
+    assert (share >= POSSIBLY) == asked_about
 
 
 def test_without_a_posterior_the_estimate_decides():
     estimate = Posterior()
     estimate.posterior = None
-    assert preferred(estimate, [np.r_[-1.0, -1.0, 3.0]], np.zeros((1, 3)))
-    assert not preferred(estimate, np.zeros((1, 3)), np.zeros((1, 3)))
+    equal = judged(estimate, np.zeros((1, 3)))
+    assert share_better(judged(estimate, [np.r_[-1.0, -1.0, 3.0]]), equal) >= CLEARLY
+    assert share_better(equal, equal) < POSSIBLY
+    posterior = judged(Posterior(), [np.r_[-1.0, -1.0, 3.0]], by_draws=False)
+    np.testing.assert_array_equal(posterior, [[1 / 3]])

@@ -38,6 +38,16 @@ class Check:
     standard_error: float = 0.0
 
 
+def judged(utility: UtilityEstimate, tried: Sequence[Trajectory], *, by_draws: bool = True) -> Float[np.ndarray, "s n"]:
+    """Utilities of a policy's n trajectories under each of S posterior draws.
+
+    One row, the utility that is acted on, without a posterior or where it is not to be `by_draws`.
+    """
+    if by_draws and utility.posterior is not None:
+        return utility.trajectory_draws(tried)
+    return utility.trajectory_utilities(tried)[None]
+
+
 def median_differences(newest: Float[np.ndarray, "s n"], best: Float[np.ndarray, "s n"]) -> Float[np.ndarray, " n"]:
     """By how much one policy's trajectories are better than another's from the same starts: of S draws the median.
 
@@ -67,15 +77,3 @@ def checked(differences: Float[np.ndarray, " n"], *, newest: int, best: int, tru
     if gain < -STANDARD_ERRORS * error:
         return Check(best, max(LEAST_TRUST, trust / 2), True, gain, error)
     return Check(best, trust, False, gain, error)
-
-
-def preferred(
-    utility: UtilityEstimate, tried: Sequence[Trajectory], kept: Sequence[Trajectory], *, share: float = CLEARLY
-) -> bool:
-    """Whether at least this share of the draws prefers a restarted policy's trajectories to the kept one's.
-
-    From the same starts; without a posterior, whether the estimate does.
-    """
-    if utility.posterior is None:
-        return bool((utility.trajectory_utilities(tried) - utility.trajectory_utilities(kept)).mean() > 0)
-    return share_better(utility.trajectory_draws(tried), utility.trajectory_draws(kept)) >= share
