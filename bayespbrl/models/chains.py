@@ -38,6 +38,7 @@ from bayespbrl.models.preference_problem import (
 from bayespbrl.models.priors import Grid, given
 from bayespbrl.models.split_dynamics import split_move
 from bayespbrl.models.step_moves import Steps, step_moves, steps_of
+from bayespbrl.models.surrogate_moves import surrogate_moves
 from bayespbrl.models.threads import in_threads
 
 # Share of each answer's Gaussian factor that enters the reference: with all of it the reference is as narrow as the
@@ -276,6 +277,9 @@ def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem)
         state, unknowns = last
         key, key_unknowns, key_weights = random.split(state.rng_key, 3)
         z, unknowns = moved(key_unknowns, state.z["utility_weights"], unknowns, problem)
+        if problem.surrogates:
+            key, key_surrogates = random.split(key)
+            z, unknowns = surrogate_moves(key_surrogates, z, unknowns, problem)
         if independent:
             ellipse = reference_ellipse(conditional(problem, unknowns))
             z = independent_move(key_weights, z, ellipse, candidates=INDEPENDENT)

@@ -48,6 +48,19 @@ class Table(NamedTuple):
     log_probabilities: Float[Array, " v"]
 
 
+class Surrogate(NamedTuple):
+    """What `bayespbrl.models.surrogate_moves` needs for one noise τ of the margins.
+
+    Attributes:
+      noise: τ.
+      root, inverse_root: A of each setting, upper triangular, with AAᵀ = (I/σ² + LᵀL/τ²)⁻¹, and A⁻¹.
+    """
+
+    noise: Scalar
+    root: Float[Array, "s q q"]
+    inverse_root: Float[Array, "s q q"]
+
+
 class JointProblem(NamedTuple):
     """Data, priors and Gaussian references of the joint model.
 
@@ -58,6 +71,7 @@ class JointProblem(NamedTuple):
       answerers: who gave each answer, one-hot; zero in padded rows.
       fitted_steepness: at which the references were fitted. They are scaled for any other steepness m, by it over m,
         and m moves together with the weights. None: neither.
+      surrogates: of further moves between settings.
     """
 
     settings: PreferenceProblem
@@ -67,6 +81,7 @@ class JointProblem(NamedTuple):
     tie_threshold: Table
     answerers: Float[Array, "a c"]
     fitted_steepness: Scalar | None = None
+    surrogates: tuple[Surrogate, ...] = ()
 
 
 class Unknowns(NamedTuple):

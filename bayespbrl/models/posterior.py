@@ -17,10 +17,13 @@ from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, refitted
 from bayespbrl.models.likelihoods import has_steps, ties_of
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
+from bayespbrl.models.surrogate_moves import with_surrogates
 from bayespbrl.models.threads import one_blas_thread
 
 # A setting that fewer draws have is not diagnosed: how many do is known too badly, and matters little.
 LEAST_SHARE = 0.05
+# Chains that have not converged after so many times the draws that they begin with also move by `surrogate_moves`.
+LONG = 4
 
 
 @dataclass(frozen=True)
@@ -159,13 +162,23 @@ def posterior_draws(
 def _until_converged(
     chains: Chains, fits: Sequence[GaussianFit], sampler: SamplerOptions
 ) -> tuple[Chains, int, Convergence]:
-    """The chains with new draws, until they converge or up to the cap, how many draws count, and the report."""
+    """The chains with new draws, until they converge or up to the cap, how many draws count, and the report.
+
+    Decision: chains that take long begin anew where they are, with further moves. Nearly all converge before, and these
+    moves would make each draw 1.5 times as slow.
+    """
     chains, wanted = replace(chains, draws=()), sampler.num_samples
     while True:
         chains = chains.extended(wanted - chains.length)
         report = chain_convergence(_diagnosed(chains, wanted, margins_of(fits, chains, wanted)))
         if report.converged() or 2 * wanted > sampler.max_samples:
             return chains, wanted, report
+        if wanted >= LONG * sampler.num_samples and not chains.problem.surrogates:
+            further = with_surrogates(chains.problem)
+            if further.surrogates:
+                chains = replace(replace(chains, problem=further).extended(sampler.num_warmup), draws=())
+                wanted = sampler.num_samples
+                continue
         wanted *= 2
 
 
