@@ -24,10 +24,10 @@ from bayespbrl.models import (
 )
 from bayespbrl.models.chains import Chains, joint_problem
 from bayespbrl.models.convergence import Convergence, chain_convergence
-from bayespbrl.models.gibbs import OTHER_THRESHOLDS, _some_thresholds, conditional
+from bayespbrl.models.gibbs import OTHER_THRESHOLDS, Unknowns, _some_thresholds, conditional
 from bayespbrl.models.posterior import SamplerOptions
 from bayespbrl.models.posterior_tree import answers_of, bases_of, margins_of
-from bayespbrl.models.surrogate_moves import with_surrogates
+from bayespbrl.models.surrogate_moves import surrogate_moves, with_surrogates
 
 INFERRED = {"steepness": None, "lapse_rate": None}
 SETTINGS = np.array([[[0.9], [0.4], [-0.2], [0.7]], [[0.1], [0.8], [1.3], [-0.3]]])
@@ -406,6 +406,30 @@ def test_further_moves_between_settings_agree_with_quadrature(settings):
         error = chain_convergence(np.asarray(drawn, float)).monte_carlo_error
         assert np.all(np.abs(np.mean(drawn, axis=(0, 1)) - expected[name]) < 4 * error + 1e-3), name
         assert np.all(error < 0.02), name
+
+
+def test_a_further_move_between_settings_leaves_the_prior_as_it_is_where_answers_say_nothing():
+    """Each setting's weights stay standard normal, and the settings equally probable, from exact draws on."""
+    rng = np.random.default_rng(1)
+    settings = rng.normal(size=(3, 4, 3)) * np.array([0.2, 1.0, 3.0])[:, None, None]
+    nothing = PreferenceModel(likelihood="logistic", steepness=1e-9, lapse_rate=0.0)
+    number = 60_000
+    with jax.enable_x64(True):
+        problem = with_surrogates(joint_problem([fit_gaussian(each, nothing) for each in settings]))
+        setting = rng.integers(3, size=number)
+        z = rng.standard_normal((number, problem.settings.loadings.shape[2]))
+        unknowns = Unknowns(setting, *np.zeros((3, number), int))
+        unknowns = unknowns._replace(lapse_rate=unknowns.lapse_rate[:, None])
+        move = jax.jit(jax.vmap(lambda key, z, unknowns: surrogate_moves(key, z, unknowns, problem)))
+        z, unknowns = move(jax.random.split(jax.random.key(0), number), z, unknowns)
+    z, after = np.asarray(z), np.asarray(unknowns.setting)
+    assert np.mean(after != setting) > 0.1
+    assert stats.chisquare(np.bincount(after, minlength=3)).pvalue > 1e-4
+    for each in range(3):
+        for coordinate in z[after == each].T:
+            assert stats.kstest(coordinate, "norm").pvalue > 1e-5
+        covariance = np.cov(z[after == each].T)
+        assert np.allclose(covariance, np.eye(len(covariance)), atol=5 * np.sqrt(2 / np.sum(after == each)))
 
 
 def test_there_are_no_further_moves_with_one_setting_or_many_answers():

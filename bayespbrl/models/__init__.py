@@ -9,6 +9,7 @@ expectation_propagation  a Gaussian close to the posterior, and the marginal lik
 gaussian_fit             both of these for given answers
 preference_problem       the model in low rank given all else, and the ellipses that sample it fast
 gibbs                    moves over all else: length scales, steepness, lapse rates, tie threshold; chains runs both
+surrogate_moves          between length scales, keeping the margins: for chains that take long to converge
 step_moves               for many answers under eq. 8: flights (refraction), lapse rates with weights (lapse_transport),
                          single weights where few answers touch each (coordinate_sweep)
 split_dynamics           for many answers without steps: dynamics round the reference
