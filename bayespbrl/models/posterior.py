@@ -66,8 +66,9 @@ def sample_posterior(
     By default steepness and lapse rate are given, as in eq. 8; `infer_utility` and the learner infer both.
     The chains have converged when every margin, and all else that is inferred, has R̂ ≤ 1.01 and at least 400 effective
     draws. This is checked after `num_samples` draws a chain and after every doubling; where it is not met at
-    `max_samples`, `converged` is 0. With several settings, chains that have not converged after four times `num_samples`
-    begin anew where they are, with further moves (`bayespbrl.models.surrogate_moves`). Everything is computed in float64.
+    `max_samples`, `converged` is 0. With several settings, chains that have not converged after four times
+    `num_samples` begin anew where they are, with further moves (`bayespbrl.models.surrogate_moves`). Everything is
+    computed in float64.
 
     Args:
       differences: ψ(preferred) − ψ(dominated), shape (K, D), used as given: divide by a scale of your choice first.
