@@ -1,7 +1,6 @@
 """The posterior over weights, settings, steepness, lapse rates and tie threshold, against quadrature and simulation."""
 
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -14,8 +13,10 @@ from scipy.special import expit, logsumexp
 from bayespbrl.models import (
     Answers,
     PreferenceModel,
+    convergence,
     fit_gaussian,
     joint_preference_model,
+    posterior,
     posterior_draws,
     priors,
     restored,
@@ -26,8 +27,8 @@ from bayespbrl.models.chains import Chains, joint_problem
 from bayespbrl.models.convergence import Convergence, chain_convergence
 from bayespbrl.models.gibbs import OTHER_THRESHOLDS, Unknowns, _some_thresholds, conditional
 from bayespbrl.models.posterior import SamplerOptions
-from bayespbrl.models.posterior_tree import answers_of, bases_of, margins_of
-from bayespbrl.models.surrogate_moves import surrogate_moves, with_surrogates
+from bayespbrl.models.posterior_tree import answers_of, bases_of
+from bayespbrl.models.surrogate_moves import NOISE, surrogate_moves, with_surrogates
 
 INFERRED = {"steepness": None, "lapse_rate": None}
 SETTINGS = np.array([[[0.9], [0.4], [-0.2], [0.7]], [[0.1], [0.8], [1.3], [-0.3]]])
@@ -381,31 +382,36 @@ def test_the_limits_of_convergence_are_those_of_vehtari_and_others(rhat, size, f
     assert report.converged() == fine
 
 
-def with_further_moves(settings, seed):
-    """Chains that move between settings by surrogates too, as if the others had not converged."""
-    fits = [fit_gaussian(each, PreferenceModel(**INFERRED)) for each in settings]
-    with jax.enable_x64(True):
-        chains = Chains.start(fits, num_chains=4, chunk=25, seed=seed).extended(50)
-        return fits, replace(chains, problem=with_surrogates(chains.problem), draws=()).extended(4000)
+CONTRADICTING = np.array([[[1.0]] * 4 + [[-1.0]] * 3 + [[0.3]], [[0.2]] * 4 + [[0.4]] * 3 + [[-0.1]]])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "settings", [SETTINGS, np.array([[[1.0]] * 4 + [[-1.0]] * 3 + [[0.3]], [[0.2]] * 4 + [[0.4]] * 3 + [[-0.1]]])]
+    ("settings", "kinds", "prior_scale"),
+    [
+        (SETTINGS, {}, 1.7),
+        (CONTRADICTING, {}, 1.0),
+        (SETTINGS, {"tied": np.array([False, True, False, False])}, 1.0),
+        (SETTINGS, {"answerers": np.array([0, 1, 1, 0])}, 1.0),
+        (SETTINGS, {"sides": np.array([1, -1, 1, 1])}, 1.0),
+    ],
 )
-def test_further_moves_between_settings_agree_with_quadrature(settings):
-    fits, chains = with_further_moves(settings, seed=4)
-    expected, _ = quadrature(settings)
-    values = {
-        "setting": chains.collected("setting", 4000),
-        "log steepness": np.log(chains.values("steepness", 4000)),
-        "lapse rate": chains.values("lapse_rate", 4000)[..., 0],
-        "margins": margins_of(fits, chains, 4000),
-    }
-    for name, drawn in values.items():
-        error = chain_convergence(np.asarray(drawn, float)).monte_carlo_error
-        assert np.all(np.abs(np.mean(drawn, axis=(0, 1)) - expected[name]) < 4 * error + 1e-3), name
-        assert np.all(error < 0.02), name
+def test_chains_with_further_moves_agree_with_quadrature(monkeypatch, settings, kinds, prior_scale):
+    monkeypatch.setattr(posterior, "LONG", 0)  # 200 draws cannot converge, so the further moves are added at once
+    monkeypatch.setattr(convergence, "SIZE_LIMIT", 4000.0)
+    names = {"tied": "indifferent", "answerers": "answerers", "sides": "shown_first"}
+    tree = sample_posterior(
+        settings / prior_scale,
+        **INFERRED,
+        prior_scale=prior_scale,
+        **{names[kind]: value for kind, value in kinds.items()},
+        num_samples=50,
+        seed=4,
+    )
+    assert tree.attrs["converged"]
+    expected, evidence = quadrature(settings, **kinds)
+    agree(tree, expected)
+    assert abs(tree.attrs["log_evidence"] - evidence) < 4 * tree.attrs["log_evidence_error"] + 1e-3 < 0.5
 
 
 def test_a_further_move_between_settings_leaves_the_prior_as_it_is_where_answers_say_nothing():
@@ -430,6 +436,15 @@ def test_a_further_move_between_settings_leaves_the_prior_as_it_is_where_answers
             assert stats.kstest(coordinate, "norm").pvalue > 1e-5
         covariance = np.cov(z[after == each].T)
         assert np.allclose(covariance, np.eye(len(covariance)), atol=5 * np.sqrt(2 / np.sum(after == each)))
+
+
+def test_the_noise_of_further_moves_is_in_units_of_the_margins():
+    settings, noise = np.random.default_rng(0).normal(size=(2, 8, 3)) / np.sqrt(3), []
+    with jax.enable_x64(True):
+        for unit, prior_scale in ((1.0, 1.0), (2.0**20, 1.0), (0.25, 8.0)):
+            problem = joint_problem([fit_gaussian(unit * each, PreferenceModel(prior_scale)) for each in settings])
+            noise.append([float(each.noise) for each in with_surrogates(problem).surrogates])
+    assert noise == [[unit * tau for tau in NOISE] for unit in (1.0, 2.0**20, 2.0)]
 
 
 def test_there_are_no_further_moves_with_one_setting_or_many_answers():

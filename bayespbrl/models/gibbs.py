@@ -71,7 +71,7 @@ class JointProblem(NamedTuple):
       answerers: who gave each answer, one-hot; zero in padded rows.
       fitted_steepness: at which the references were fitted. They are scaled for any other steepness m, by it over m,
         and m moves together with the weights. None: neither.
-      surrogates: of further moves between settings.
+      surrogates: matrices of the moves that keep the margins, one for each τ; empty: no such moves.
     """
 
     settings: PreferenceProblem

@@ -1,16 +1,19 @@
 """Gibbs moves between settings of the features that keep the margins nearly as they are, for chains that get stuck.
 
 The moves of `bayespbrl.models.gibbs` carry the weights from one setting's Gaussian reference to that of another. Where
-answers contradict each other, a reference is far from every part of the posterior: each part follows other answers,
-and one that two settings share is carried to where it has no probability. Here the weights are carried by what they
-say of the answers instead. Noisy margins are drawn, g ~ N(L z, τ²I). Given g the weights have a Gaussian distribution
-N(m, AAᵀ) under each setting, before the answers. Setting and weights move together so that g and the whitened weights
-A⁻¹ (z − m) stay (surrogate data; Murray and Adams 2010). A small τ keeps the margins; with a large one this is the move
-of weights that are whitened by the prior.
+answers contradict each other, the posterior has several modes, each of which follows other answers, and references are
+far from all of them: a mode that two settings share is then mapped to a point of negligible probability. The moves
+here keep the margins instead, and with them which answers are followed.
+
+Noisy margins are drawn, g ~ N(L z, τ²I). Given g the weights have a Gaussian distribution N(m, AAᵀ) under each
+setting, before the answers. Setting and weights move together so that g and the whitened weights A⁻¹ (z − m) stay
+(surrogate data; Murray and Adams 2010). A small τ keeps the margins; with a large one this is the move of weights that
+are whitened by the prior.
 """
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
@@ -18,21 +21,27 @@ from jaxtyping import Float, PRNGKeyArray
 
 from bayespbrl.models.gibbs import FEW, JointProblem, Surrogate, Unknowns, log_likelihood
 
-# Standard deviations τ of the noise; margins have 1 a priori.
+# Standard deviations τ of the noise, where margins have a root mean square of 1 a priori.
 NOISE = (0.1, 0.5)
 
 
 def with_surrogates(problem: JointProblem, noise: Sequence[float] = NOISE) -> JointProblem:
-    """The same problem with a move for each τ; as it is with one setting, or with more than `FEW` answers."""
-    loadings = np.asarray(problem.settings.loadings)
-    settings, capacity, rank = loadings.shape
-    if settings == 1 or capacity > FEW:
-        return problem
+    """The same problem with a move for each τ; unchanged where there is one setting or more than `FEW` answers.
+
+    τ is in units of the margins: of their scale a priori, rounded to a power of two.
+    """
+    loadings, prior_scale = np.asarray(problem.settings.loadings), float(problem.settings.prior_scale)
     squares = np.einsum("skq,skr->sqr", loadings, loadings)
-    prior_precision = np.eye(rank) / float(problem.settings.prior_scale) ** 2
-    inverse_roots = [np.linalg.cholesky(prior_precision + squares / tau**2).mT for tau in noise]
-    them = [(tau, np.linalg.inv(each), each) for tau, each in zip(noise, inverse_roots, strict=True)]
-    return problem._replace(surrogates=tuple(Surrogate(*map(jnp.asarray, each)) for each in them))
+    rows = np.sum(np.any(loadings != 0, axis=2))
+    if len(loadings) == 1 or loadings.shape[1] > FEW or not rows:
+        return problem
+    unit = 2.0 ** np.round(np.log2(prior_scale * np.sqrt(np.trace(squares, axis1=1, axis2=2).sum() / rows)))
+    prior_precision = np.eye(loadings.shape[2]) / prior_scale**2
+    them = []
+    for tau in unit * np.asarray(noise):
+        inverse_root = np.linalg.cholesky(prior_precision + squares / tau**2).mT
+        them.append(Surrogate(*jax.device_put((tau, np.linalg.inv(inverse_root), inverse_root))))
+    return problem._replace(surrogates=tuple(them))
 
 
 def surrogate_moves(
