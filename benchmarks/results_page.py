@@ -43,6 +43,8 @@ TOLERANCE = 1e-5  # relative: the data have six digits
 # Of a cell that is run again on another machine: rounding does not show in the first iteration, and little in the
 # second (2e-5 of the value in `levers`, on a processor of another kind).
 EXACT_ITERATIONS, ROUNDED = 2, 1e-3
+# Seconds, as committed, of the iterations that are run again; the rest of a trial that took longer is not.
+LONGEST = 300.0
 
 
 def committed() -> dict[str, StudyData]:
@@ -119,16 +121,23 @@ def cheapest(data: StudyData) -> RowData | None:
     return min(learned, key=lambda row: float(row.lines["seconds"].sum() / len(row.seeds)), default=None)
 
 
+def repeated(lines: pd.DataFrame) -> int:
+    """How many iterations of a trial are run again: all, but of a long one those of its first `LONGEST` seconds."""
+    return max(EXACT_ITERATIONS, int((lines["seconds"].cumsum() <= LONGEST).sum()))
+
+
 def again(row: RowData, processes: Executor) -> list[dict[str, Any]]:
-    """The iterations of the first trial of a row, run anew in one of the processes."""
+    """The iterations of the first trial of a row, run anew in one of the processes, as many as are `repeated`."""
     seed = row.seeds[0]
+    kept = row.lines[row.lines["seed"] == seed]
+    most = None if row.declared.baseline or repeated(kept) >= len(kept) else repeated(kept)
     with tempfile.TemporaryDirectory() as folder:
         learner = row_of(row.declared.env, Path(folder) / "row", row.declared.options, seed=seed)
         cell = replace(learner, baseline=row.declared.baseline)
-        processes.submit(run_trial, cell, seed).result()
+        processes.submit(run_trial, cell, seed, iterations=most).result()
         entries: list[dict[str, Any]]
         entries = (read_summary if cell.baseline is None else read_baseline)(cell.path(seed))["iterations"]
-        return entries
+        return entries[:most]
 
 
 def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
@@ -145,9 +154,13 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
         return []
     seed, entries = row.seeds[0], again(row, processes)
     kept = row.lines[row.lines["seed"] == seed]
-    where = f"study {data.name}, {row.declared.name}, seed {seed}"
-    parts = [data.description, *data.description.get("earlier", [])]
-    same = all(part.get("rounding") == rounding() for part in parts)  # studies that began before it was kept have none
+    where, part = f"study {data.name}, {row.declared.name}, seed {seed}", ""
+    if row.declared.baseline is None and repeated(kept) < len(kept):
+        kept, part = kept.iloc[: repeated(kept)], f" in its first {repeated(kept)} iterations"
+    origins = [data.description, *data.description.get("earlier", [])]
+    same = all(
+        each.get("rounding") == rounding() for each in origins
+    )  # studies that began before it was kept have none
     found = [
         (
             entry["iteration"],
@@ -167,7 +180,7 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
     if not found and len(entries) != len(kept):
         found = [(0, np.inf, f"{where}: expected {len(kept)} iterations, got {len(entries)}")]
     if not found:
-        print(f"{where}: as kept.")
+        print(f"{where}: as kept{part}.")
     return [text for *_, text in found]
 
 

@@ -162,6 +162,22 @@ def test_a_published_curve_stands_beside_the_values_after_as_many_answers():
 
 
 @pytest.mark.slow
+def test_of_a_long_trial_the_first_iterations_are_run_again(capsys):
+    page = benchmark("results_page")
+    data = page.committed()["smoke"]
+    for row in data.rows:
+        row.lines["seconds"] = 0.4 * page.LONGEST
+    with page.trial_processes(1) as processes:
+        row = page.cheapest(data)
+        assert [entry["iteration"] for entry in page.again(row, processes)] == [1, 2]
+        assert page.differences_of_a_cell(data, processes) == []
+        assert "in its first 2 iterations" in capsys.readouterr().out
+        row.lines.loc[row.lines["iteration"] == 2, "answers"] += 1
+        (found,) = page.differences_of_a_cell(data, processes)
+    assert "iteration 2: expected answers" in found
+
+
+@pytest.mark.slow
 def test_a_cell_is_reproduced_and_another_value_is_found():
     page = benchmark("results_page")
     data = page.committed()["smoke"]

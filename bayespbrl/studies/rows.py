@@ -195,10 +195,14 @@ class Seeds:
         return [seed for seed in self.with_outcome(None) if seed not in self.damaged]
 
 
-def run_trial(row: Row, seed: int) -> bool:
+def run_trial(row: Row, seed: int, *, iterations: int | None = None) -> bool:
     """Run one trial to its end, from where it stopped if it was begun; returns whether it counts.
 
     One that another process has finished in the meantime is left as it is.
+
+    Args:
+      row, seed: which trial.
+      iterations: a run of the learner stops at the first question after so many; None: at its end.
 
     Raises:
       ContinuedElsewhere: another process runs it.
@@ -223,12 +227,14 @@ def run_trial(row: Row, seed: int) -> bool:
         if row.baseline is not None:
             measure_baseline(learner, row.baseline, path)
             return True
-        return _trained(row, learner, path)
+        return _trained(row, learner, path, iterations)
 
 
-def _trained(row: Row, learner: Learner, path: Path) -> bool:
+def _trained(row: Row, learner: Learner, path: Path, iterations: int | None) -> bool:
     expert = expert_of(learner)
     while not (redraws := _redraws(row, learner)) and (questions := learner.ask()):
+        if iterations is not None and learner.state.iteration >= iterations:
+            return False
         learner.tell([expert(*query.trajectories) for query in questions])
     if redraws:
         return False
