@@ -44,7 +44,7 @@ TOLERANCE = 1e-5  # relative: the data have six digits
 # second (2e-5 of the value in `levers`, on a processor of another kind).
 EXACT_ITERATIONS, ROUNDED = 2, 1e-3
 # Seconds, as committed, of the iterations that are run again; the rest of a trial that took longer is not.
-LONGEST = 300.0
+LONGEST = 200.0
 
 
 def committed() -> dict[str, StudyData]:
