@@ -121,16 +121,19 @@ def cheapest(data: StudyData) -> RowData | None:
     return min(learned, key=lambda row: float(row.lines["seconds"].sum() / len(row.seeds)), default=None)
 
 
-def repeated(lines: pd.DataFrame) -> int:
-    """How many iterations of a trial are run again: all, but of a long one those of its first `LONGEST` seconds."""
-    return max(EXACT_ITERATIONS, int((lines["seconds"].cumsum() <= LONGEST).sum()))
+def repeated(row: RowData) -> int | None:
+    """How many iterations of a row's first trial are run again, those of its first `LONGEST` seconds; None: all.
+
+    A baseline's trial is run whole.
+    """
+    seconds = row.lines.loc[row.lines["seed"] == row.seeds[0], "seconds"].cumsum()
+    number = max(EXACT_ITERATIONS, int((seconds <= LONGEST).sum()))
+    return None if row.declared.baseline is not None or number >= len(seconds) else number
 
 
 def again(row: RowData, processes: Executor) -> list[dict[str, Any]]:
     """The iterations of the first trial of a row, run anew in one of the processes, as many as are `repeated`."""
-    seed = row.seeds[0]
-    kept = row.lines[row.lines["seed"] == seed]
-    most = None if row.declared.baseline or repeated(kept) >= len(kept) else repeated(kept)
+    seed, most = row.seeds[0], repeated(row)
     with tempfile.TemporaryDirectory() as folder:
         learner = row_of(row.declared.env, Path(folder) / "row", row.declared.options, seed=seed)
         cell = replace(learner, baseline=row.declared.baseline)
@@ -153,14 +156,11 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
         print(f"study {data.name}: nothing is run again (version {data.description.get('version')}).")
         return []
     seed, entries = row.seeds[0], again(row, processes)
-    kept = row.lines[row.lines["seed"] == seed]
-    where, part = f"study {data.name}, {row.declared.name}, seed {seed}", ""
-    if row.declared.baseline is None and repeated(kept) < len(kept):
-        kept, part = kept.iloc[: repeated(kept)], f" in its first {repeated(kept)} iterations"
-    origins = [data.description, *data.description.get("earlier", [])]
-    same = all(
-        each.get("rounding") == rounding() for each in origins
-    )  # studies that began before it was kept have none
+    most = repeated(row)
+    kept = row.lines[row.lines["seed"] == seed].iloc[:most]
+    where = f"study {data.name}, {row.declared.name}, seed {seed}"
+    parts = [data.description, *data.description.get("earlier", [])]
+    same = all(part.get("rounding") == rounding() for part in parts)  # studies that began before it was kept have none
     found = [
         (
             entry["iteration"],
@@ -180,7 +180,7 @@ def differences_of_a_cell(data: StudyData, processes: Executor) -> list[str]:
     if not found and len(entries) != len(kept):
         found = [(0, np.inf, f"{where}: expected {len(kept)} iterations, got {len(entries)}")]
     if not found:
-        print(f"{where}: as kept{part}.")
+        print(f"{where}: as kept{'' if most is None else f' in its first {most} iterations'}.")
     return [text for *_, text in found]
 
 

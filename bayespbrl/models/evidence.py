@@ -45,6 +45,7 @@ def log_evidence(chains: Chains, length: int, *, seed: int) -> tuple[float, floa
     with jax.enable_x64(True):
         points = np.concatenate([z.reshape(rows, rank), proposed])
         points, together = jax.device_put((points, together))
+        # the moves' matrices do not enter, and would be a compilation more
         ratios = np.asarray(_log_ratios(chains.problem._replace(surrogates=()), points, Unknowns(*together)))
     of_posterior = ratios[:rows].reshape(z.shape[:2])
     relative = float(np.min(chain_convergence(of_posterior[..., None]).effective_sample_size)) / rows

@@ -175,13 +175,13 @@ def _until_converged(
         report = chain_convergence(_diagnosed(chains, wanted, margins_of(fits, chains, wanted)))
         if report.converged() or 2 * wanted > sampler.max_samples:
             return chains, wanted, report
-        if wanted >= LONG * sampler.num_samples and not chains.problem.surrogates:
-            further = with_surrogates(chains.problem)
-            if further.surrogates:
-                chains = replace(replace(chains, problem=further).extended(sampler.num_warmup), draws=())
-                wanted = sampler.num_samples
-                continue
-        wanted *= 2
+        slow = wanted >= LONG * sampler.num_samples
+        further = with_surrogates(chains.problem) if slow else chains.problem
+        if further is chains.problem:
+            wanted *= 2
+        else:
+            chains = replace(replace(chains, problem=further).extended(sampler.num_warmup), draws=())
+            wanted = sampler.num_samples
 
 
 def _needs_better_references(chains: Chains, fit: GaussianFit, model: PreferenceModel) -> bool:

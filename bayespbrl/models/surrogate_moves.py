@@ -26,10 +26,12 @@ NOISE = (0.1, 0.5)
 
 
 def with_surrogates(problem: JointProblem, noise: Sequence[float] = NOISE) -> JointProblem:
-    """The same problem with a move for each τ; unchanged where there is one setting or more than `FEW` answers.
+    """The same problem with a move for each τ; as it is if it has them, with one setting, or above `FEW` answers.
 
     τ is in units of the margins: of their scale a priori, rounded to a power of two.
     """
+    if problem.surrogates:
+        return problem
     loadings, prior_scale = np.asarray(problem.settings.loadings), float(problem.settings.prior_scale)
     squares = np.einsum("skq,skr->sqr", loadings, loadings)
     rows = np.sum(np.any(loadings != 0, axis=2))
