@@ -93,10 +93,10 @@ TASKS = {
 # The Gridworld is without what the default has come to do where states are discrete: its figures are older.
 TASKS["gridworld"] |= dict.fromkeys(("standardised_utility", "informative_ties", "noise_free"), False)
 TASKS["gridworld"] |= {"critic_iterations": 4}
-# So are those of the two with continuous actions.
+# So are those of the three with continuous actions.
 WITHOUT_EFFORT = dict.fromkeys(("effort_utility", "noise_free", "against_kept"), False)
-TASKS["swing-up"] |= WITHOUT_EFFORT
-TASKS["bicycle"] |= WITHOUT_EFFORT
+for _task in ("swing-up", "bicycle", "acrobot"):
+    TASKS[_task] |= WITHOUT_EFFORT
 # An environment object of the user's is known by its gymnasium id.
 IDS = {identity: short for short, identity in SHORT_NAMES.items()}
 DEFAULT: dict[str, Any] = {
