@@ -226,7 +226,8 @@ def test_continuous_actions_have_effort_and_their_policies_are_compared_without_
 
     assert options() == (True, True, True)
     assert options(expert="page") == (False, False, False)  # people see states, and would wait
-    assert options("swing-up") == options("bicycle") == (False, False, False)  # as their figures were measured
+    for measured_without in ("swing-up", "bicycle", "acrobot"):
+        assert options(measured_without) == (False, False, False)
     assert options(preset="paper") == (False, False, False)
     for without in ({"noise_free": False}, {"checked": False}):
         assert options(**without) == (True, False, False)
