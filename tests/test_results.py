@@ -160,6 +160,15 @@ def test_the_budget_is_what_the_options_allow_where_all_trials_of_a_row_ended_be
         assert (second["at answers"], second["difference"][: len(difference)]) == (answers, difference)
 
 
+@pytest.mark.parametrize("option", ["queries_per_iteration = 12", "first_queries = 15", "against_kept = true"])
+def test_an_option_that_is_legal_with_what_the_default_derives_of_a_task_is_read(made, option):
+    # more trajectories an iteration, and policies without noise, are derived only where the task is known
+    declared = DECLARATION.replace("paper", "default").replace("iterations = 4", "")
+    (made / "study.toml").write_text(declared.replace("[methods.first]", f"[methods.first]\n{option}"))
+    table = values_table(read_study(made)).set_index("methods")
+    assert table.loc["second", "at answers"] == "20"
+
+
 def test_trials_that_are_missing_are_counted_and_never_replaced_by_another_row(made):
     kept = json.loads((made / "study.json").read_text()) | {"trials": 4}
     (made / "study.json").write_text(json.dumps(kept))

@@ -231,7 +231,12 @@ def test_continuous_actions_have_effort_and_their_policies_are_compared_without_
     assert options(preset="paper") == (False, False, False)
     for without in ({"noise_free": False}, {"checked": False}):
         assert options(**without) == (True, False, False)
-    for without in ({"clip_steps": 20}, {"utility": "linear-program"}, {"utility": "known-reward"}):
+    for without in (
+        {"clip_steps": 20},
+        {"utility": "linear-program"},
+        {"utility": "known-reward"},
+        {"trajectories_per_iteration": 2, "first_queries": 1},
+    ):
         assert options(**without) == (True, True, False)
     discrete = replace(TASK, action_space=Discrete(2))
     assert not settings_for("SomebodysEnv-v3", task=discrete).questions.against_kept

@@ -236,6 +236,11 @@ def test_features_of_any_scale_count(scale):
     assert np.all(plain.weights != 0)
 
 
+def test_features_that_differ_by_less_than_a_number_can_be_divided_by_say_nothing():
+    estimate = infer_utility(1e-310 * np.eye(2), [(0, 1)])
+    assert np.all(estimate.weights == 0)
+
+
 def test_nobody_and_no_tie_among_no_answers_may_be_empty_lists():
     none = infer_utility(np.eye(2), [], answerers=[], shown_first=[], ties=[])
     assert np.all(none.weights == 0)

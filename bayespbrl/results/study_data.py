@@ -12,13 +12,15 @@ import numpy as np
 import pandas as pd
 
 from bayespbrl import checks
-from bayespbrl.settings import settings_for
+from bayespbrl.settings import MOST_TRAJECTORIES, settings_for
 from bayespbrl.studies.declaration import AXES, Declaration, DeclaredRow, parsed
 from bayespbrl.studies.study import FIGURES, read_study_json
 from bayespbrl.studies.tables import by_answers
 
 ITERATION_COLUMNS = [*AXES, "seed", "iteration", *FIGURES]
 ANSWER_COLUMNS = [*AXES, "seed", "question", "iteration", "predicted", "first"]
+# Options that need what the default derives from the task; without it, values that allow whatever a study ran with.
+WITHOUT_TASK = {"trajectories_per_iteration": MOST_TRAJECTORIES, "against_kept": False}
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ class RowData:
     @property
     def allowed(self) -> int:
         """The budget of answers, by the options; or the most that a trial used, if that is more."""
-        return max(int(self.used.max()), settings_for(self.declared.env, **self.declared.options).most_answers)
+        options = {**self.declared.options, **WITHOUT_TASK}
+        return max(int(self.used.max()), settings_for(self.declared.env, **options).most_answers)
 
     def at(self, answers: float) -> np.ndarray | None:
         """Value of each trial after that many answers, or its last where it ended with fewer.

@@ -12,6 +12,8 @@ from bayespbrl.models import Answers
 from bayespbrl.preferences import pair_differences
 from bayespbrl.trajectories import Trajectory, trajectory_features
 
+LEAST_DIFFERENCE = 1e-290  # of feature sums; what is divided by a smaller one may be no number
+
 
 @dataclass(frozen=True)
 class Comparisons:
@@ -86,10 +88,12 @@ def normalised(differences: Float[np.ndarray, "k d"]) -> tuple[Float[np.ndarray,
     Decision: under w ~ N(0, I) the margins wᵀψ then have the variance 1 in the mean over the answers, whatever the
     features. The answers do not tell the amplitude of the utility. Fixed like this it is the same under all settings of
     the features, so that a setting counts in a mean of utilities by its probability alone; and steepness, tie threshold
-    and side bias mean the same under each.
+    and side bias mean the same under each. Differences that are all below `LEAST_DIFFERENCE` count as 0.
     """
     largest = float(np.max(np.abs(differences), initial=0.0))
     checks.finite("feature_sums: differences", largest)  # of two that are near the largest number
+    if 0.0 < largest < LEAST_DIFFERENCE:
+        return np.zeros_like(differences), 1.0
     if largest and not 1e-150 < largest < 1e150:  # its square is no number
         scaled, scale = normalised(differences / largest)
         return scaled, scale * largest
