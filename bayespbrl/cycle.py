@@ -98,7 +98,7 @@ class Cycle(Collection):
 
     def _chosen_questions(self, state: LearnerState, known: Sequence[Trajectory]) -> questions.Chosen:
         options, rng = self.settings.questions, self._rng(CHOOSE, state.iteration)
-        favourite = state.best if state.restart is None else min(state.restart.number, state.started - 1)
+        favourite = self._favourite(state)
         new, best = range(len(state.trajectories), len(known)), self._of_iteration(favourite)
         opponents = opponents_from_the_same_start(known, state.preferences, best) if options.same_start else {}
         standing = state.preferences.undominated
@@ -133,6 +133,13 @@ class Cycle(Collection):
         """
         remaining = self.settings.last_iteration(state.started) - state.iteration
         return state.nominated and remaining <= 2 * state.left(self.settings)
+
+    def _favourite(self, state: LearnerState) -> int:
+        """The iteration that followed the kept policy; of one that was replaced at a restart, the last before."""
+        if state.restart is None:
+            return state.best
+        kept, started = state.restart.number, state.started
+        return kept if kept > started else min(kept, started - 1)
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""

@@ -15,7 +15,7 @@ from bayespbrl.events import Entry, LearnerState, Log
 from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
-from bayespbrl.policies import Policy, Sampler, greedy
+from bayespbrl.policies import Policy, Sampler, greedy, has_mode
 from bayespbrl.policies.choice import expected_policy, fitting, initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
 from bayespbrl.queries import QUERY_RULES, QueryRule
@@ -80,12 +80,12 @@ class Learner:
             "environment": None if (how := opening.reopened(env)) == "named" else how,
             "schedule": "other" if callable(schedule) else schedule,
             "query": "other" if callable(query) else query,
+            "noise_free": None if own_policy is None or has_mode(own_policy) else False,
         }
         self.settings: Settings = kept or settings_for(
             env if isinstance(env, str) else opening.environment_name(self.environment),
             task=Task.of(self.environment, options.get("max_steps")),
-            **{name: value for name, value in own.items() if value is not None},
-            **options,
+            **{name: value for name, value in own.items() if value is not None} | options,
         )
         self.features = features
         period = opening.environment_attribute(self.environment, "observation_period")

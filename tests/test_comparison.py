@@ -6,7 +6,7 @@ from scipy.special import expit
 
 from bayespbrl.diagnostics import compare_likelihoods, plot_comparison, predictions
 from bayespbrl.diagnostics import comparison as comparison_module
-from bayespbrl.models import PreferenceModel, posterior_draws
+from bayespbrl.models import Answers, PreferenceModel, posterior_draws
 
 SAMPLING = {"num_warmup": 50, "num_samples": 250, "max_samples": 250}
 FEW = {"num_warmup": 25, "num_samples": 25, "max_samples": 25}  # where any draws will do
@@ -116,10 +116,26 @@ def test_answers_of_no_difference_are_predicted_as_such():
         name: PreferenceModel(likelihood="logistic", steepness=8.0, tie_threshold=threshold)
         for name, threshold in (("narrow", 0.001), ("wide", 0.2))
     }
-    result = compare_likelihoods(rows, candidates, folds=4, indifferent=tied, **SAMPLING)
+    result = compare_likelihoods(rows, candidates, folds=4, answers=Answers(tied), **SAMPLING)
     assert list(result["candidate"].values) == ["wide", "narrow"]
     assert np.all(result["log_probability"].sel(candidate="narrow")[tied] < np.log(0.1))
     assert np.all(result["log_probability"].sel(candidate="wide")[tied] > np.log(0.3))
+
+
+@pytest.mark.slow
+def test_what_a_candidate_leaves_open_is_inferred_with_sides_under_each_setting_of_the_features():
+    rows = np.array([[0.6], [0.05], [0.5], [-0.04]])
+    answers = Answers(np.array([False, True, False, True]), shown_first=np.array([1, 1, -1, 1]))
+    inferred = PreferenceModel(steepness=None, lapse_rate=None)
+    result = compare_likelihoods(
+        np.stack([rows, np.sqrt(np.abs(rows))]), {"inferred": inferred}, folds=4, answers=answers, **SAMPLING
+    )
+    asked = np.arange(4) == 0
+    alone, _ = predictions.held_out_probabilities(
+        np.stack([rows, np.sqrt(np.abs(rows))]), inferred, ~asked, asked, answers=answers, seed=0, **SAMPLING
+    )
+    assert result["log_probability"].values[0, 0] == pytest.approx(np.log(alone[0, 0]), abs=1e-12)
+    assert np.all(result["log_probability"] < 0)
 
 
 @pytest.mark.slow
@@ -142,8 +158,7 @@ def test_the_figure_names_each_candidate_on_the_axes_given(comparison):
         ({"candidates": {}}, "candidates: expected at least one, got none"),
         ({"folds": 1}, "folds: expected a whole number >= 2, got 1"),
         ({"folds": 2.0}, "folds: expected a whole number >= 2, got 2.0"),
-        ({"indifferent": np.ones(3, dtype=bool)}, r"indifferent: expected bool of shape \(5,\)"),
-        ({"indifferent": np.ones(5, dtype=bool)}, "candidates: expected a tie_threshold .* got none in"),
+        ({"answers": Answers(np.ones(3, dtype=bool))}, r"indifferent: expected bool of shape \(5,\)"),
         ({"groups": np.arange(3)}, "groups: expected 5 integers"),
     ],
 )

@@ -17,6 +17,7 @@ from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, ques
 from bayespbrl import cycle as cycle_module
 from bayespbrl.diagnostics.estimates import predicted_answer
 from bayespbrl.envs.gridworld import REWARDS
+from bayespbrl.events.state import LearnerState, Restart
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.improvement.update import NEARLY
 from bayespbrl.models import restored, stored
@@ -818,6 +819,31 @@ def test_the_last_trajectory_of_an_updated_policy_is_without_its_noise(same_star
         np.testing.assert_array_equal(observation, trajectory.states[0].astype(np.float32))
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class WithoutMode(LinearGaussianPolicy):
+    """A policy of a user's that does not know its most probable action."""
+
+    mode = None
+
+
+def test_the_trajectories_of_a_policy_without_a_mode_are_not_shown_as_if_they_had_no_noise():
+    spaces = gymnasium.make("Pendulum-v1").observation_space, gymnasium.make("Pendulum-v1").action_space
+    for kind, expected in ((LinearGaussianPolicy, True), (WithoutMode, False)):
+        settings = Learner("Pendulum-v1", policy=kind.initial(*spaces, initial_scale=0.5)).settings
+        assert (settings.rollouts.noise_free, settings.questions.against_kept) == (expected, expected)
+
+
+@pytest.mark.parametrize(
+    ("started", "kept", "followed"), [(None, 5, 5), (8, 3, 3), (8, 8, 7), (8, 12, 12)], ids=lambda number: str(number)
+)
+def test_the_favourite_of_a_start_is_of_the_iteration_that_followed_the_kept_policy(started, kept, followed):
+    # at a restart after eight iterations the eighth policy was followed by none; one since then may be confirmed
+    restart = None if started is None else Restart(started, kept, "policy", ())
+    state = LearnerState(*["policy"] * 3, best=kept if restart is None else 9, restart=restart)
+    assert learner().cycle._favourite(state) == followed
+
+
 def everything(situation):
     return [situation.incumbent, *range(len(situation.trajectories) - 1, situation.incumbent, -1)]
 
@@ -888,13 +914,6 @@ class Ordinary:
     def probabilities(self, observations):
         return np.full((len(observations), 5), 0.2)
 
-    @classmethod
-    def initial(cls, observation_space, action_space):
-        return cls()
-
-    def log_prob(self, observation, action):
-        return np.log(0.2)
-
     def entropy(self, observation):
         return np.log(5)
 
@@ -908,7 +927,7 @@ class Ordinary:
 class WithoutEntropy:
     """All of a policy but its entropy."""
 
-    initial, sample, log_prob, kl_divergence, fit = (None,) * 5
+    sample, kl_divergence, fit = (None,) * 3
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayespbrl.models import PreferenceModel, plain_draws
+from bayespbrl.models import PreferenceModel, plain_chain, plain_draws
 from bayespbrl.models.likelihoods import log_prob
 from bayespbrl.settings import Settings
 from bayespbrl.utility.inference import Estimation
@@ -32,6 +32,23 @@ def test_a_long_plain_chain_has_the_posterior_and_a_short_one_says_that_it_has_n
     padded = np.vstack([DIFFERENCES, np.zeros((1, 6))])
     same = plain_draws(padded, MODEL, draws=2000, seed=2, number_of_preferences=4)
     np.testing.assert_allclose(same["utility_weights_mean"], short["utility_weights_mean"], atol=1e-9)
+
+
+@pytest.mark.parametrize("draws", [16, 200, 2000, 2999, 3998, 7998, 200_000])
+def test_the_first_half_is_discarded_and_the_kept_draws_are_as_far_apart_as_fit_into_the_second(monkeypatch, draws):
+    class Asked(Exception):
+        pass
+
+    def asked(state, problem, burn_in, between, *, length):
+        raise Asked(burn_in, between, length)
+
+    monkeypatch.setattr(plain_chain, "_moves", asked)
+    with pytest.raises(Asked) as raised:
+        plain_draws(DIFFERENCES, MODEL, draws=draws, seed=0)
+    burn_in, between, length = raised.value.args
+    assert burn_in + between * length == draws
+    assert length <= 1000
+    assert draws / 2 <= burn_in < draws / 2 + between + 1
 
 
 def test_plain_draws_need_everything_else_given():

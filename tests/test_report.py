@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -29,7 +30,7 @@ from bayespbrl.diagnostics.report import summary as report_summary
 from bayespbrl.diagnostics.report import tables as report_tables
 from bayespbrl.diagnostics.report import write as report_write
 from bayespbrl.diagnostics.report.answers import surprise_order
-from bayespbrl.diagnostics.report.contents import read_contents
+from bayespbrl.diagnostics.report.contents import RunContents, read_contents
 from bayespbrl.diagnostics.report.formatting import number
 from bayespbrl.diagnostics.report.warnings import find_warnings
 from bayespbrl.diagnostics.report.write import assembled, write_report
@@ -739,6 +740,14 @@ def test_a_run_that_the_command_line_cannot_continue_is_continued_in_python(tmp_
     text = read(write_report(tmp_path / "mine")).text
     assert f"in Python with bayespbrl.resume('{tmp_path / 'mine'}')" in text
     assert "bayespbrl resume" not in text
+
+
+def test_a_run_whose_answers_all_came_in_its_first_iteration_is_finished_by_the_summaries_alone():
+    settings = bayespbrl.Learner("gridworld", preset="paper", answers=2, iterations=None).settings
+    summaries = ({"answers": 2},) * 6
+    contents = RunContents(Path(), settings, summaries)
+    assert contents.finished == settings.finished(6, 2, 5, 0) is True
+    assert not replace(contents, iterations=summaries[:2]).finished
 
 
 def test_a_log_that_has_lost_iterations_is_not_called_intact(gridworld_copy):

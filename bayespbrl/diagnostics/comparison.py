@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 
 from bayespbrl import checks
 from bayespbrl.diagnostics.predictions import PREFERRED, TIED, answer_groups, held_out_probabilities
-from bayespbrl.models import Answers, PreferenceModel
+from bayespbrl.models import NOTHING_ELSE, Answers, PreferenceModel
+from bayespbrl.models.posterior_tree import settings_of
 
 
 def compare_likelihoods(
@@ -21,19 +22,21 @@ def compare_likelihoods(
     *,
     folds: int = 5,
     groups: np.ndarray | None = None,
-    indifferent: np.ndarray | None = None,
+    answers: Answers = NOTHING_ELSE,
     seed: int = 0,
     **sampling_options: int,
 ) -> xr.Dataset:
     """Expected log predictive density (elpd) of the answers under each candidate.
 
     Args:
-      differences: ψ(preferred) − ψ(dominated), shape (K, D); eq. 8 keeps the full K.
+      differences: ψ(preferred) − ψ(dominated), shape (K, D), or (C, K, D) under C settings of the features; eq. 8 keeps
+        the full K.
       candidates: models by name.
       folds: >= 2, assigned at random; leave-one-out with as many folds as answers.
       groups: the number of the answer that each row follows from, shape (K,), never decreasing: rows of one answer are
         left out together. Every row is an answer of its own by default.
-      indifferent: which answers were "no difference", shape (K,) bool. Every candidate then needs a `tie_threshold`.
+      answers: ties, sides and answerers of the rows. What a candidate leaves open, such as the tie threshold, is
+        inferred.
       seed: of the folds and of the sampler.
       sampling_options: `num_samples` and the like, the same for all candidates.
 
@@ -44,20 +47,15 @@ def compare_likelihoods(
 
     Source: Vehtari, Gelman & Gabry (2017), section 2.3 and eq. 24.
     """
-    differences = checks.matrix("differences", differences)
-    number = len(differences)
+    settings = settings_of(differences)
+    number = settings.shape[1]
     groups = answer_groups(groups, number)
     fold = _assigned_folds(groups, checks.whole("folds", folds, 2), seed=seed)
-    tied = np.zeros(number, dtype=bool) if indifferent is None else checks.flags("indifferent", indifferent, number)
+    answers = answers.checked(number)
     if not candidates:
         raise ValueError("candidates: expected at least one, got none")
-    lacking = [name for name, model in candidates.items() if tied.any() and model.tie_threshold is None]
-    if lacking:
-        raise ValueError(
-            f"candidates: expected a tie_threshold in each, because some answers are ties, got none in {lacking}"
-        )
     results = [
-        _held_out_log_probability(differences, model, fold, tied, seed=seed, **sampling_options)
+        _held_out_log_probability(settings, model, fold, answers, seed=seed, **sampling_options)
         for model in candidates.values()
     ]
     log_probability, converged = (np.array(values) for values in zip(*results, strict=True))
@@ -80,15 +78,16 @@ def plot_comparison(result: xr.Dataset, axes: Axes) -> Axes:
 
 
 def _held_out_log_probability(
-    differences: np.ndarray, model: PreferenceModel, fold: np.ndarray, tied: np.ndarray, **sampling_options: int
+    settings: np.ndarray, model: PreferenceModel, fold: np.ndarray, answers: Answers, **sampling_options: int
 ) -> tuple[np.ndarray, bool]:
     """Log probability of each answer given the other folds, shape (K,), and whether every refit converged."""
+    tied = np.zeros(len(fold), bool) if answers.indifferent is None else np.asarray(answers.indifferent)
     outcome = np.where(tied, TIED, PREFERRED)
     log_probability, converged = np.zeros(len(fold)), True
     for held_out in np.unique(fold):
         asked = fold == held_out
         probabilities, fit_converged = held_out_probabilities(
-            differences, model, ~asked, asked, answers=Answers(tied if tied.any() else None), **sampling_options
+            settings, model, ~asked, asked, answers=answers, **sampling_options
         )
         chosen = probabilities[np.arange(len(probabilities)), outcome[asked]]
         with np.errstate(divide="ignore"):  # an answer that the model rules out: log 0

@@ -32,7 +32,7 @@ def predicted_answer(
     Args:
       estimate: with a posterior.
       answerer: who is asked, as the posterior names them: "" who gave no name where others did. A name that it does not
-        know, or None, has the lapse rate of all of them together, and no side bias.
+        know, or None where it knows names, has the lapse rate of all of them together, and no side bias.
 
     Returns:
       that, ½ where the model rules out that either is, and the probability that either is preferred: 1 where nobody

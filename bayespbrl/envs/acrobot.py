@@ -154,7 +154,7 @@ class Acrobot(FunctionalEnv):
     | 3   | angular velocity θ̇₂, limited                      | -9π | 9π  | rad/s |
 
     ## Reward
-    −1 a step, the one that reaches the goal included; an episode earns between −500 and minus the steps it took.
+    −1 a step, the one that reaches the goal included; an episode earns minus the number of its steps, at least −500.
 
     ## Start
     At rest, hanging down.

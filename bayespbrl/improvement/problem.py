@@ -19,6 +19,7 @@ from bayespbrl.utility.estimate import UtilityEstimate
 # Bounds on the transitions of the last iterations that LSTD takes: about ten for each of its features, and no more than
 # a person would wait for.
 LEAST_TRANSITIONS, MOST_TRANSITIONS = 5_000, 10_000
+LEAST_TRAJECTORIES = 10  # however long: the last two of an iteration may be without noise, and say little of Q
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class PolicyUpdate:
         spread up to 3.6 times. The paper's is 1.
       recent_iterations: number of last iterations whose states the update takes; None for all.
       critic_iterations: number of last iterations whose transitions LSTD takes, but at least `LEAST_TRANSITIONS` and at
-        most `MOST_TRANSITIONS`; None for all, as in the paper. Old ones say little about the current policy.
+        most `MOST_TRANSITIONS`, or `LEAST_TRAJECTORIES` if they have more; None for all, as in the paper. Old ones say
+        little about the current policy.
       checked: whether each update is checked by trajectories of the policy without its noise: the run keeps the policy
         that the posterior thinks best, without noise, and goes on from there after a step back. The paper's learner
         never looks back.
@@ -145,7 +147,7 @@ def recent(trajectories: Sequence[Trajectory], options: PolicyUpdate, *, an_iter
         return trajectories
     lengths = np.cumsum([len(trajectory) for trajectory in reversed(trajectories)])
     least = 1 + int(np.searchsorted(lengths, LEAST_TRANSITIONS))
-    most = max(1, int(np.searchsorted(lengths, MOST_TRANSITIONS, side="right")))
+    most = max(LEAST_TRAJECTORIES, int(np.searchsorted(lengths, MOST_TRANSITIONS, side="right")))
     return trajectories[-max(least, min(most, options.critic_iterations * an_iteration)) :]
 
 

@@ -29,7 +29,7 @@ class RepsSolution:
     Attributes:
       sample_weights: wᵢ = pᵢ/Wᵢ for the weighted fit of eq. 14, mean 1 under W.
       probabilities: pᵢ of eq. 12, sum 1.
-      value_weights: v with V(s) = vᵀφ(s), in the units of Q.
+      value_weights: v with V(s) = vᵀφ(s) up to a constant, in the units of Q.
       temperature: η in the units of Q.
       kl: KL(p‖W) in nats.
       kl_bound: ε that was asked for, in nats.
@@ -152,7 +152,7 @@ def reps_weights(
     return RepsSolution(
         sample_weights=probabilities / base,  # eq. 14; mean Σ W·p/W = 1 by construction
         probabilities=probabilities,
-        value_weights=scale * (constraint.mapping @ dual),  # eq. 12: V(s) = vᵀφ(s)
+        value_weights=scale * (constraint.mapping @ dual),  # eq. 12: V(s) = vᵀφ(s) + constant
         temperature=scale * temperature,
         kl=float(probabilities[positive] @ np.log((probabilities / base)[positive])),  # eq. 11
         kl_bound=kl_bound,
@@ -210,7 +210,7 @@ def reps_weights_by_state(
         feature_gap_raw=gap,
         rank_kept=int(np.sum(visits > 0)) - 1,
         converged=True,
-        status=CONSTANT if constant else "in closed form",
+        status=CONSTANT if constant else "a root of one equation",
     )
 
 

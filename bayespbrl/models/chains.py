@@ -61,7 +61,6 @@ LEAST_LAPSES = 0.005
 # Draws that one call of the compiled sampler makes; its length is part of what is compiled.
 CHUNK = 25
 
-
 Recorded = tuple[EllipticalSliceState, Unknowns, Float[Array, "*draws k"]]
 Chunk = tuple[tuple[EllipticalSliceState, Unknowns], Recorded]
 
@@ -266,7 +265,8 @@ KERNEL, KERNEL_OF_SWEEP = (
 
 def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem) -> Recorded:
     """One draw of one chain, and log p of each answer there."""
-    unknown = any(len(prior) > 1 for prior in (problem.log_probabilities, *(table.values for table in problem[2:5])))
+    grids = problem.steepness.values, problem.lapse_rate.values, problem.tie_threshold.values
+    unknown = any(len(prior) > 1 for prior in (problem.log_probabilities, *grids))
     capacity, rank = problem.settings.loadings.shape[1:]
     kernel, sweeps = (KERNEL_OF_SWEEP, SWEEPS) if unknown and capacity <= FEW else (KERNEL, 1)
     independent = capacity > FEW and rank <= LOW_DIMENSION and has_steps(problem.settings.likelihood)

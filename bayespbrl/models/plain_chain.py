@@ -31,7 +31,7 @@ from bayespbrl.models.preference_problem import PreferenceProblem, low_rank_mode
 from bayespbrl.models.threads import one_blas_thread
 
 LEAST = 16  # draws: half of them are kept, and R̂ needs twice four
-# Decision: this many draws of the second half are kept, evenly spaced; the moves between them are not stored.
+# Decision: at most this many draws of the second half are kept, evenly spaced; the moves between them are not stored.
 KEPT = 1000
 
 
@@ -68,13 +68,13 @@ def plain_draws(
     fits = [fit_gaussian(settings[0], model, number_of_preferences=number)]
     # paper, experiments: as many samples for the burn-in as for the evaluation
     half = draws // 2
-    kept = min(half, KEPT)
+    between = -(-half // KEPT)
+    kept = half // between
     with jax.enable_x64(True), one_blas_thread():
         chains = Chains.start(fits, num_chains=1, chunk=kept, seed=seed)
         problem = conditional(chains.problem, jax.tree.map(lambda x: x[0], chains.unknowns))
         start = model.prior_scale * np.random.default_rng([seed, 5]).standard_normal(problem.loadings.shape[1])
         state = KERNEL.init(jax.random.key(seed), 0, {"utility_weights": start}, (problem,))
-        between = half // kept
         recorded = _moves(state, problem, draws - kept * between, between, length=kept)
         chains = replace(chains, draws=(_part(chains, *map(np.asarray, recorded)),))
         margins = margins_of(fits, chains, kept)[:, : kept // 2 * 2]

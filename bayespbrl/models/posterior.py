@@ -64,8 +64,9 @@ def sample_posterior(
 
     What is None is inferred with the weights, and so is which of several settings of the features explains the answers.
     By default steepness and lapse rate are given, as in eq. 8; `infer_utility` and the learner infer both.
-    The chains have converged when every margin, and all else that is inferred, has R̂ ≤ 1.01 and at least 400 effective
-    draws. This is checked after `num_samples` draws a chain and after every doubling; where it is not met at
+    The chains have converged when every margin (side biases are part of them), every hyperparameter, and membership in
+    each setting that has at least a twentieth of the draws, has R̂ ≤ 1.01 and at least 400 effective draws. This is
+    checked after `num_samples` draws a chain and after every doubling; where it is not met at
     `max_samples`, `converged` is 0. With several settings and at most 64 answers, chains that have not converged after
     four times `num_samples` restart from their current states with moves added (`models.surrogate_moves`), if twice as
     many are allowed; earlier draws are discarded and do not count towards the cap. Everything is computed in float64.

@@ -37,7 +37,8 @@ def given(value: float) -> Grid:
     return _even(np.array([float(value)]))
 
 
-# m: a margin of one standard deviation is answered rightly with probability 0.73 at the lowest, and surely at most.
+# m: by the sigmoid a margin of one standard deviation is answered rightly with probability 0.73 at the lowest, and
+# surely at most; under eq. 8 with probability 1 - 0.27/K at the lowest.
 STEEPNESS = _even(_medians(stats.lognorm(s=1.0, scale=5.0), 9))
 # λ: half of all answerers are attentive; of the others it is Beta(1, 3), mean a quarter, and above a half in 13 %.
 _LAPSES = _medians(stats.beta(1, 3), 12)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import entr
 
 from bayespbrl import queries, questions
 from bayespbrl.envs.opening import environment_name
@@ -80,7 +79,11 @@ def said_of(query: Query, state: LearnerState) -> tuple[View, tuple[Answer, ...]
         said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
         thresholds = state.estimate.tie_thresholds(queries.QUERY_DRAWS)
         if thresholds is not None:
-            said |= _said_with_ties(chances_with_ties(margins, likelihood, thresholds))
+            chances = chances_with_ties(margins, likelihood, thresholds)
+            worth = queries.expected_information(
+                draws[:, :1], draws[:, 1:], likelihood=likelihood, tie_thresholds=thresholds
+            )
+            said |= {"sure": float(chances.max()), "worth": float(worth[0] / np.log(2)), "most": np.log2(3)}
         if said["worth"] < LITTLE:
             said["advice"] = (
                 f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
@@ -92,19 +95,11 @@ def said_of(query: Query, state: LearnerState) -> tuple[View, tuple[Answer, ...]
 
 def chances_with_ties(
     margins: Float[np.ndarray, "s 1"], likelihood: Likelihood, thresholds: np.ndarray
-) -> Float[np.ndarray, "3 s"]:
-    """Probability of "first", "second" and "no difference" at each posterior draw."""
+) -> Float[np.ndarray, " 3"]:
+    """Posterior probability of "first", "second" and "no difference"."""
     likelihood = with_threshold(likelihood, thresholds, np.zeros(1, dtype=bool))
-    first, second = (np.ravel(prob(likelihood, sign * margins)) for sign in (1, -1))
-    return np.stack([first, second, np.maximum(1 - first - second, 0.0)])
-
-
-def _said_with_ties(chances: Float[np.ndarray, "3 s"]) -> View:
-    """How sure the learner is of one of three answers, and the bits that one tells, of so many at most."""
-    mean = chances.mean(axis=1)
-    # Houlsby et al. (2011), eq. 2, of three answers
-    worth = max(0.0, float(entr(mean).sum() - entr(chances).sum(axis=0).mean()))
-    return {"sure": float(mean.max()), "worth": worth / np.log(2), "most": np.log2(3)}
+    first, second = (float(prob(likelihood, sign * margins).mean()) for sign in (1, -1))
+    return np.array([first, second, max(1 - first - second, 0.0)])
 
 
 def with_ties(
@@ -119,8 +114,8 @@ def with_ties(
     """
     if thresholds is None:
         return likely
-    mean = chances_with_ties(margins, likelihood, thresholds).mean(axis=1)
-    chances = dict(zip((Answer.FIRST, Answer.SECOND, Answer.TIE), mean, strict=True))
+    each = chances_with_ties(margins, likelihood, thresholds)
+    chances = dict(zip((Answer.FIRST, Answer.SECOND, Answer.TIE), each, strict=True))
     ordered = sorted(chances, key=lambda answer: -chances[answer])
     return (*ordered[:2], Answer.SKIP, ordered[2])
 

@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float, Key, Shaped
 from numpy.typing import ArrayLike
 
-from bayespbrl.policies.policy import AnyArray, Policy, Sampler
+from bayespbrl.policies.policy import AnyArray, Policy, Sampler, WithDensity
 
 CHUNK = 1024
 
@@ -33,7 +33,7 @@ def _sample_chunk(
 
 @jax.jit
 def _log_prob_chunk(
-    policy: Policy, observations: Shaped[AnyArray, "n ..."], actions: Shaped[AnyArray, "n ..."]
+    policy: WithDensity, observations: Shaped[AnyArray, "n ..."], actions: Shaped[AnyArray, "n ..."]
 ) -> Float[Array, " n"]:
     return jax.vmap(policy.log_prob)(observations, actions)
 
@@ -52,7 +52,7 @@ def sample_actions(policy: Sampler, key: Key[Array, ""], observations: ArrayLike
         return _in_chunks(lambda start, rows: _sample_chunk(policy, key, np.uint32(start), rows), observations)
 
 
-def log_probabilities(policy: Policy, observations: ArrayLike, actions: ArrayLike) -> Float[np.ndarray, " n"]:
+def log_probabilities(policy: WithDensity, observations: ArrayLike, actions: ArrayLike) -> Float[np.ndarray, " n"]:
     """log π(aᵢ|sᵢ) for each row."""
     observations, actions = np.asarray(observations), np.asarray(actions)
     if len(observations) != len(actions):

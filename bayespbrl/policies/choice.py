@@ -68,7 +68,7 @@ def expected_policy(given: object) -> str:
     """What was expected where something was given that is no policy, for an error."""
     if isinstance(given, type):
         return f"a policy, an object, got the class {given.__name__}"
-    methods = ("initial", "sample", "log_prob", "entropy", "kl_divergence", "fit")
+    methods = ("sample", "entropy", "kl_divergence", "fit")
     if (lacks := [name for name in methods if not hasattr(given, name)]) and len(lacks) < len(methods):
         return f"a policy (bayespbrl.policies.Policy), got a {type(given).__name__} without {', '.join(lacks)}"
     return f"a policy (bayespbrl.policies) or a kind by name, got {given!r}"

@@ -1,10 +1,9 @@
 """The protocol of a stochastic policy π(a|s) (paper, preliminaries and eq. 14)."""
 
-from typing import Any, Protocol, Self, TypeGuard, runtime_checkable
+from typing import Protocol, Self, TypeGuard, runtime_checkable
 
 import jax
 import numpy as np
-from gymnasium import Space
 from jax import Array
 from jaxtyping import Float, Key, Shaped
 from numpy.typing import ArrayLike
@@ -32,18 +31,6 @@ class Policy(Sampler, Protocol):
     probable action, JAX-traceable: without it a run keeps the policy with its noise; and `converged`, whether the last
     fit succeeded, which a run reports.
     """
-
-    @classmethod
-    def initial(cls, observation_space: Space[Any], action_space: Space[Any]) -> Self:
-        """The policy before any fit; keyword options are each policy's own.
-
-        `ValueError` where the spaces do not suit this kind of policy.
-        """
-        ...
-
-    def log_prob(self, observation: Shaped[AnyArray, "..."], action: Shaped[AnyArray, "..."]) -> Float[Array, ""]:
-        """log π(a|s): the log mass of a discrete action, the log density of a continuous one."""
-        ...
 
     def entropy(self, observation: Shaped[AnyArray, "..."]) -> Float[Array, ""]:
         """Entropy of π(·|s) in nats (differential for continuous actions)."""
@@ -87,6 +74,14 @@ class ContinuousPolicy(Policy, Protocol):
 
     def action_standard_deviation(self, observations: ArrayLike) -> Float[np.ndarray, "n a"]:
         """Standard deviation of each action dimension at each of N observations."""
+        ...
+
+
+class WithDensity(Protocol):
+    """A policy that knows the probabilities of its actions."""
+
+    def log_prob(self, observation: Shaped[AnyArray, "..."], action: Shaped[AnyArray, "..."]) -> Float[Array, ""]:
+        """log π(a|s): the log mass of a discrete action, the log density of a continuous one; JAX-traceable."""
         ...
 
 

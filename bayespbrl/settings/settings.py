@@ -234,7 +234,11 @@ class Settings:
 
     @property
     def most_iterations(self) -> int:
-        """The limit on iterations: `iterations`, else three for every two answers, plus those of a restarted policy."""
+        """The limit on iterations.
+
+        `iterations`; else three for every two answers, with those of a restarted policy (and `LAST_ITERATIONS` before
+        it at least), or `LAST_ITERATIONS` more where none is restarted.
+        """
         if self.iterations is not None:
             return self.iterations
         most = 3 * cast(int, self.questions.answers) // 2  # there is one of the two limits

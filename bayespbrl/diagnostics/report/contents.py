@@ -77,9 +77,10 @@ class RunContents:
         """
         if self.finished_by_log is not None:
             return self.finished_by_log
-        answers = [summary.get("answers", 0) for summary in self.iterations]  # none in a damaged summary
-        unasked = next((n for n, before in enumerate(reversed(answers[:-1])) if before != answers[-1]), 0)
-        return self.settings.finished(len(answers), answers[-1] if answers else 0, unasked, self.started)
+        number = len(self.iterations)
+        answers = [0, *(summary.get("answers", 0) for summary in self.iterations)]  # none in a damaged summary
+        unasked = next((n for n, before in enumerate(reversed(answers[:-1])) if before != answers[-1]), number)
+        return self.settings.finished(number, answers[-1], unasked, self.started)
 
     @property
     def started(self) -> int:
