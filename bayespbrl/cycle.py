@@ -24,8 +24,9 @@ from bayespbrl.improvement.schedules import Bound, Situation
 from bayespbrl.improvement.update import Improvement, apply_update, propose
 from bayespbrl.models.threads import one_blas_thread
 from bayespbrl.policies import greedy
-from bayespbrl.preferences import Answer, opponent_now, opponents_from_the_same_start, rivals
+from bayespbrl.preferences import Answer
 from bayespbrl.queries import QuerySituation
+from bayespbrl.questions import opponent_now, opponents_from_the_same_start, rivals
 from bayespbrl.trajectories import Trajectory, clips_of, transitions
 from bayespbrl.utility.comparisons import Comparisons
 from bayespbrl.utility.estimate import UtilityEstimate

@@ -17,10 +17,10 @@ from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
 from bayespbrl.policies import Policy, Sampler, greedy, has_mode
 from bayespbrl.policies.choice import expected_policy, fitting, initial_policy
-from bayespbrl.preferences import Answer, Preferences, Query, parse_answer, same_starts
+from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
 from bayespbrl.queries import QUERY_RULES, QueryRule
 from bayespbrl.settings import Settings, Task, settings_for
-from bayespbrl.trajectories import Trajectory
+from bayespbrl.trajectories import Trajectory, same_starts
 from bayespbrl.utility.estimate import UtilityEstimate
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """Preferences ζ: questions, answers, the ordered pairs and the undominated trajectories (paper, step 4)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -10,6 +10,8 @@ from jaxtyping import Float, Int
 
 from bayespbrl import checks
 from bayespbrl.trajectories import Trajectory
+
+Stated = tuple[tuple[tuple[int, int], ...], tuple[int, ...]]  # ordered pairs, and the undominated after them
 
 
 class Answer(StrEnum):
@@ -177,28 +179,37 @@ class Preferences:
             raise ValueError(f"newcomer: expected another trajectory than the incumbent, got {newcomer}")
         if preferred not in (None, newcomer, incumbent):
             raise ValueError(f"preferred: expected {newcomer}, {incumbent} or None, got {preferred}")
-        beside = self.undominated if rivals is None else tuple(each for each in rivals if each in self.undominated)
-        beside = tuple(each for each in beside if each != newcomer)
-        beaten = [each for each in (newcomer, incumbent) if rivals is not None and self.has_fallen(each)]
-        if beaten:
-            beside = (incumbent,)
-        elif incumbent not in beside:
-            beside = (*beside, incumbent)
-        others = tuple(each for each in self.undominated if each not in (*beside, newcomer))
         asked = (incumbent, newcomer) if preferred == incumbent else (newcomer, incumbent)
-        new_pairs, ties, standing = tuple[tuple[int, int], ...](), self.ties, (*others, *beside)
-        if beaten:
-            standing = tuple(each for each in self.undominated if each != newcomer or preferred is None)
-        if preferred is None:
-            ties, standing = (*ties, asked), standing if beaten else (*standing, newcomer)
-        elif preferred == newcomer:
-            new_pairs = tuple((newcomer, member) for member in beside)
-            standing = others if newcomer in beaten else (*others, newcomer)
+        if rivals is not None and (self.has_fallen(newcomer) or self.has_fallen(incumbent)):
+            pairs, standing = self._of_two_alone(newcomer, incumbent, preferred)
         else:
-            new_pairs = tuple((member, newcomer) for member in beside)
+            pairs, standing = self._of_all_rivals(newcomer, incumbent, preferred, rivals)
+        ties = self.ties if preferred is not None else (*self.ties, asked)
         standing = standing or self.undominated  # answers in a circle leave none
-        after = Preferences(self.pairs + new_pairs, standing, self.answers + 1, ties, self.sources)
+        after = Preferences(self.pairs + pairs, standing, self.answers + 1, ties, self.sources)
         return after._with_sources(self, asked, shown_first, answerer)
+
+    def _of_two_alone(self, newcomer: int, incumbent: int, preferred: int | None) -> Stated:
+        """The ordered pair that an answer about two of which one has fallen states, and who is undominated then."""
+        if preferred is None:
+            return (), self.undominated
+        worse = incumbent if preferred == newcomer else newcomer
+        rises = () if preferred == incumbent or self.has_fallen(newcomer) else (newcomer,)
+        return ((preferred, worse),), (*(each for each in self.undominated if each not in (worse, newcomer)), *rises)
+
+    def _of_all_rivals(
+        self, newcomer: int, incumbent: int, preferred: int | None, rivals: Sequence[int] | None
+    ) -> Stated:
+        """The ordered pairs of a newcomer with all its rivals, and who is undominated then."""
+        among = self.undominated if rivals is None else rivals
+        beside = [each for each in among if each in self.undominated and each != newcomer]
+        beside += [] if incumbent in beside else [incumbent]
+        others = [each for each in self.undominated if each not in (*beside, newcomer)]
+        if preferred is None:
+            return (), (*others, *beside, newcomer)
+        if preferred == newcomer:
+            return tuple((newcomer, each) for each in beside), (*others, newcomer)
+        return tuple((each, newcomer) for each in beside), (*others, *beside)
 
     def has_fallen(self, trajectory: int) -> bool:
         """Whether it was compared, and is undominated no longer."""
@@ -297,54 +308,3 @@ def known_pairs(name: str, pairs: Sequence[tuple[int, int]], known: int) -> Int[
             got = tuple(numbers[bad][0].tolist())
             raise ValueError(f"{name}: expected {expected}, got {got} as number {bad.argmax()}")
     return numbers
-
-
-def same_starts(trajectories: Sequence[Trajectory]) -> list[list[int]]:
-    """The numbers of the trajectories, grouped by their start."""
-    groups: dict[bytes, list[int]] = {}
-    for number, trajectory in enumerate(trajectories):
-        groups.setdefault(np.asarray(trajectory.states[0]).tobytes(), []).append(number)
-    return list(groups.values())
-
-
-def opponents_from_the_same_start(
-    trajectories: Sequence[Trajectory], preferences: Preferences, favourites: Sequence[int]
-) -> dict[int, int]:
-    """The opponent of each trajectory: another from the same start; no entry where there is none.
-
-    That is the newest undominated one that was shown, else one of `favourites`, else the first.
-    """
-    chosen, standing = {}, preferences.undominated
-    for group in same_starts(trajectories):
-        members = set(group)
-        ranked = [
-            *(number for number in reversed(standing) if number in members),
-            *(number for number in favourites if number in members),
-            *group[:2],
-        ]
-        for number in group:
-            rivals = [other for other in ranked if other != number]
-            if rivals:
-                chosen[number] = rivals[0]
-    return chosen
-
-
-def opponent_now(
-    newcomer: int, opponents: Mapping[int, int], trajectories: Sequence[Trajectory], preferences: Preferences
-) -> int:
-    """The newcomer's opponent, the newest undominated trajectory where there are no `opponents`.
-
-    One that another question of the iteration has beaten gives way to who is undominated from its start by then.
-    """
-    opponent = opponents[newcomer] if opponents else preferences.undominated[-1]
-    if not preferences.has_fallen(opponent):
-        return opponent
-    group = next(group for group in same_starts(trajectories) if opponent in group)
-    return next((each for each in reversed(preferences.undominated) if each in group and each != newcomer), opponent)
-
-
-def rivals(query: Query, trajectories: Sequence[Trajectory], preferences: Preferences) -> list[int]:
-    """The undominated trajectories from the start of both, which the newcomer competes with; else all of them."""
-    both = {query.newcomer, query.incumbent}
-    together = [group for group in same_starts(trajectories) if both <= set(group)]
-    return [number for number in preferences.undominated if not together or number in together[0]]

@@ -1,4 +1,4 @@
-"""Step 4: the questions of an iteration: how many, about which trajectories, or an earlier one again.
+"""Step 4: the questions of an iteration: how many, about which trajectories, against which, or an earlier one again.
 
 In which order trajectories are worth asking about is a query rule's matter (`queries`).
 """
@@ -12,7 +12,7 @@ import numpy as np
 from bayespbrl import checks
 from bayespbrl.preferences import Answer, PastQuestion, Preferences, Query
 from bayespbrl.queries import QUERY_RULES, QueryRule, QuerySituation, candidates, random_candidates
-from bayespbrl.trajectories import Trajectory
+from bayespbrl.trajectories import Trajectory, same_starts
 from bayespbrl.utility.estimate import UtilityEstimate
 
 UNASKED_SIGNAL = 0.5  # from this signal on an iteration may ask nothing
@@ -246,3 +246,46 @@ def still_waiting(queries: Sequence[Query], waiting: Sequence[Query]) -> list[Qu
             )
         found.append(same)
     return found
+
+
+def opponents_from_the_same_start(
+    trajectories: Sequence[Trajectory], preferences: Preferences, favourites: Sequence[int]
+) -> dict[int, int]:
+    """The opponent of each trajectory: another from the same start; no entry where there is none.
+
+    That is the newest undominated one that was shown, else one of `favourites`, else the first.
+    """
+    chosen, standing = {}, preferences.undominated
+    for group in same_starts(trajectories):
+        members = set(group)
+        ranked = [
+            *(number for number in reversed(standing) if number in members),
+            *(number for number in favourites if number in members),
+            *group[:2],
+        ]
+        for number in group:
+            rivals = [other for other in ranked if other != number]
+            if rivals:
+                chosen[number] = rivals[0]
+    return chosen
+
+
+def opponent_now(
+    newcomer: int, opponents: Mapping[int, int], trajectories: Sequence[Trajectory], preferences: Preferences
+) -> int:
+    """The newcomer's opponent, the newest undominated trajectory where there are no `opponents`.
+
+    One that another question of the iteration has beaten gives way to who is undominated from its start by then.
+    """
+    opponent = opponents[newcomer] if opponents else preferences.undominated[-1]
+    if not preferences.has_fallen(opponent):
+        return opponent
+    group = next(group for group in same_starts(trajectories) if opponent in group)
+    return next((each for each in reversed(preferences.undominated) if each in group and each != newcomer), opponent)
+
+
+def rivals(query: Query, trajectories: Sequence[Trajectory], preferences: Preferences) -> list[int]:
+    """The undominated trajectories from the start of both, which the newcomer competes with; else all of them."""
+    both = {query.newcomer, query.incumbent}
+    together = [group for group in same_starts(trajectories) if both <= set(group)]
+    return [number for number in preferences.undominated if not together or number in together[0]]

@@ -149,3 +149,11 @@ def trajectory_features(
     discounts = np.concatenate([discount ** np.arange(len(t)) for t in trajectories])
     starts = np.cumsum([0] + [len(t) for t in trajectories[:-1]])
     return np.add.reduceat(table * discounts[:, None], starts, axis=0)  # eq. 1
+
+
+def same_starts(trajectories: Sequence[Trajectory]) -> list[list[int]]:
+    """The numbers of the trajectories, grouped by their start."""
+    groups: dict[bytes, list[int]] = {}
+    for number, trajectory in enumerate(trajectories):
+        groups.setdefault(np.asarray(trajectory.states[0]).tobytes(), []).append(number)
+    return list(groups.values())

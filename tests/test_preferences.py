@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bayespbrl.preferences import Answer, Preferences, opponent_now, pair_differences, parse_answer
+from bayespbrl.preferences import Answer, Preferences, pair_differences, parse_answer
+from bayespbrl.questions import opponent_now
 from bayespbrl.trajectories import Trajectory
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayespbrl.models.likelihoods import Logistic, Mixed, Probit, WithLapses
-from bayespbrl.preferences import Preferences, opponents_from_the_same_start, rivals, same_starts
+from bayespbrl.preferences import Preferences
 from bayespbrl.queries import (
     ONLY_TIES,
     QUERY_RULES,
@@ -19,8 +19,16 @@ from bayespbrl.queries import (
     random_candidates,
     show,
 )
-from bayespbrl.questions import LEAST_INFORMATION, Questions, confirmation, first_questions, later_questions
-from bayespbrl.trajectories import Trajectory
+from bayespbrl.questions import (
+    LEAST_INFORMATION,
+    Questions,
+    confirmation,
+    first_questions,
+    later_questions,
+    opponents_from_the_same_start,
+    rivals,
+)
+from bayespbrl.trajectories import Trajectory, same_starts
 
 
 class Draws:
