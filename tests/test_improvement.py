@@ -1,7 +1,6 @@
 """Step 2: on a small discrete problem with a known model, and once with continuous actions."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import numpy as np
@@ -10,9 +9,9 @@ from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.features import (
     OneHot,
+    OwnFeatures,
     RadialBasisOptions,
     StateActionProduct,
-    checked_features,
     draw_state_action_features,
 )
 from bayespbrl.improvement import q_function, update
@@ -465,7 +464,7 @@ def test_features_of_the_users_own_constrain_the_states_alike_in_any_units():
     policy, steps, options = few_samples()
 
     def features_in(unit):
-        return partial(checked_features, lambda s: s * [1.0, unit])
+        return OwnFeatures(lambda s: s * [1.0, unit])
 
     plain, mixed = (
         improve(policy, steps, steps.actions[:, 0], **options | {"state_features": features_in(unit)})

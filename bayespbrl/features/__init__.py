@@ -2,7 +2,7 @@
 
 Features are callables on NumPy arrays, drawn anew at each iteration from the observed samples. Each is a frozen
 dataclass of arrays and numbers, so that a run can store what it used. A user's own state features are any function of
-observations; `checked_features` calls it.
+observations; `OwnFeatures` checks what it returns.
 
 functions   what features are: functions of arrays, checked
 discrete    of discrete states
@@ -12,7 +12,7 @@ drawn       those of an environment, drawn at what was observed
 
 from bayespbrl.features.discrete import DiffusionBasis, OneHot, diffusion_basis
 from bayespbrl.features.drawn import FeatureSource, StateActionProduct, draw_state_action_features, draw_state_features
-from bayespbrl.features.functions import StateActionFeatures, StateFeatures, checked_features, linear
+from bayespbrl.features.functions import OwnFeatures, StateActionFeatures, StateFeatures, checked_features, linear
 from bayespbrl.features.radial import JointRadialBasis, RadialBasis, RadialBasisOptions
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "FeatureSource",
     "JointRadialBasis",
     "OneHot",
+    "OwnFeatures",
     "RadialBasis",
     "RadialBasisOptions",
     "StateActionFeatures",

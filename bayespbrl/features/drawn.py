@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from bayespbrl.checks import indices, matrix
 from bayespbrl.features.discrete import MOST_CONNECTED, OneHot, diffusion_basis, standardised
-from bayespbrl.features.functions import StateFeatures, checked_features
+from bayespbrl.features.functions import OwnFeatures, StateFeatures
 from bayespbrl.features.radial import JointRadialBasis, RadialBasis, RadialBasisOptions
 from bayespbrl.trajectories import Trajectory, Transitions
 
@@ -117,7 +116,7 @@ class FeatureSource:
         Where all are equally long and none ended by itself, there is no constant feature.
         """
         if self.own is not None:
-            return partial(checked_features, self.own)
+            return OwnFeatures(self.own)
         space = self.observation_space
         if options.diffusion and isinstance(space, Discrete):
             if space.n > MOST_CONNECTED:

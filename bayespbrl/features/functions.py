@@ -1,6 +1,7 @@
 """What features are to the rest of the package: functions of arrays, which are checked, and their linear functions."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -23,6 +24,17 @@ def checked_features(features: StateFeatures, states: Shaped[np.ndarray, "n ..."
     if (bad := ~np.isfinite(values := values.astype(np.float64)).all(axis=1)).any():
         raise ValueError(f"features {name}: expected finite numbers, got NaN or infinity for state {states[bad][0]}")
     return values
+
+
+@dataclass(frozen=True)
+class OwnFeatures:
+    """φ(s) of the user's: any function of observations, in any units, whose values are checked."""
+
+    function: StateFeatures
+
+    def __call__(self, states: Shaped[np.ndarray, "n ..."]) -> Float[np.ndarray, "n d"]:
+        """`checked_features` of the function."""
+        return checked_features(self.function, states)
 
 
 def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "n ..."]:

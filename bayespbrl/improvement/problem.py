@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from gymnasium import Space
 from jaxtyping import Float, Int, Shaped
 
 from bayespbrl import checks
-from bayespbrl.features import StateActionFeatures, StateFeatures
+from bayespbrl.features import OwnFeatures, StateActionFeatures, StateFeatures
 from bayespbrl.improvement.q_function import Critic
 from bayespbrl.policies.samples import location_and_deviation
 from bayespbrl.trajectories import Trajectory, Transitions
@@ -121,7 +121,7 @@ class UpdateProblem:
         """
         states, shares = self.visited
         features = self.state_features(states)
-        if not isinstance(self.state_features, partial):
+        if not isinstance(self.state_features, OwnFeatures):
             return features
         deviation = location_and_deviation(features, shares)[1]
         return features / np.where(deviation > 0, deviation, 1.0)

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import xarray as xr
 
 from bayespbrl import checks
 from bayespbrl.events import Entry
-from bayespbrl.features import StateFeatures, checked_features
+from bayespbrl.features import OwnFeatures, StateFeatures
 from bayespbrl.models import restored, stored
 from bayespbrl.runs.files import NETCDF, check_file, write_netcdf
 from bayespbrl.runs.stored_classes import NAMES, from_tree, to_tree
@@ -155,7 +154,7 @@ def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Seq
     if utility.attrs.get("features") == "other":
         if features is None:
             raise ValueError("an estimate with features of your own: pass them again as features=")
-        given["features"] = partial(checked_features, features)  # as while the run learned
+        given["features"] = OwnFeatures(features)  # as while the run learned
     if "class" not in utility.attrs:  # by an earlier version: the posterior's groups say which of two it is
         numbers = {name: float(utility.attrs[name]) for name in ("discount", "scale") if name in utility.attrs}
         kind = "posterior" if "posterior" in given else "linear-program"

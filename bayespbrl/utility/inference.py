@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 from xarray import DataTree
 
 from bayespbrl import checks
-from bayespbrl.features import DiffusionBasis, RadialBasis, StateFeatures, checked_features
+from bayespbrl.features import DiffusionBasis, OwnFeatures, RadialBasis, StateFeatures
 from bayespbrl.models import Answers, PreferenceModel, linear_program, plain_chain, plain_draws, posterior_draws
 from bayespbrl.models.posterior_tree import bases_of
 from bayespbrl.preferences import known_pairs
@@ -213,4 +212,4 @@ def _as_they_are(states: np.ndarray) -> np.ndarray:
 def _checking(features: StateFeatures) -> StateFeatures:
     """φ of the user's with its values checked; ours check themselves, and their bandwidths are read."""
     checks.function("features", features, " of states (N, S)")
-    return features if isinstance(features, RadialBasis | DiffusionBasis) else partial(checked_features, features)
+    return features if isinstance(features, RadialBasis | DiffusionBasis) else OwnFeatures(features)
