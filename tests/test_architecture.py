@@ -1,6 +1,7 @@
 """The plan of the house, read from the source: who may import whom, and how large a room may be."""
 
 import ast
+import re
 from pathlib import Path
 
 import numpy as np
@@ -154,6 +155,17 @@ def test_a_modules_first_line_says_what_it_is():
         text = ast.get_docstring(tree_of(module)) or ""
         assert 10 < len(text.partition("\n")[0]) <= 117, module
         assert path.read_text().startswith('"""'), module
+
+
+def test_a_package_of_several_modules_names_each_of_them_and_no_other():
+    for package in ROOT.rglob("__init__.py"):
+        rooms = {path.stem for path in package.parent.glob("*.py")} - {"__init__"}
+        overview = ast.get_docstring(ast.parse(package.read_text())) or ""
+        if len(rooms) > 3 and package.parent != ROOT:  # README has the map of the whole
+            assert rooms <= set(re.findall(r"\w+", overview)), package
+        starts = re.findall(r"^([a-z_]+(?:, [a-z_]+)*)(?: {2,}|$)", overview, flags=re.MULTILINE)
+        named = {name for start in starts for name in start.split(", ")}
+        assert named <= rooms | {path.name for path in package.parent.iterdir()}, package
 
 
 def test_the_links_at_the_top_level_lead_into_the_package():

@@ -1,4 +1,11 @@
-"""The environments of the paper, registered with gymnasium on import."""
+"""The environments of the paper, registered with gymnasium on import.
+
+gridworld, bicycle, swing_up, acrobot  the four domains: their dynamics as pure functions; angles helps them
+functional                             pure functions as a gymnasium environment
+opening                                any environment, made ready for the learner; spaces: rows of numbers
+stepping                               episodes of environments without pure functions
+pictures, film_strip                   a trajectory as a picture
+"""
 
 from importlib import import_module
 
