@@ -51,10 +51,10 @@ class Collection:
         if not self.settings.rollouts.noise_free or not state.iteration:
             return ()
         if self.settings.questions.against_kept:
-            kept = state.best_policy if state.restart is None else state.restart.policy
-            return (state.kept_policy, state.first_policy) if restarts else (kept, state.policy)
+            kept = state.best if state.restart is None else state.restart.kept
+            return (state.kept.policy, state.first_policy) if restarts else (kept.policy, state.newest.policy)
         updated = state.iteration > state.started and not restarts
-        return (state.policy,) if updated and has_mode(state.policy) else ()
+        return (state.newest.policy,) if updated and has_mode(state.newest.policy) else ()
 
     def _tried(self, policy: Sampler) -> tuple[Trajectory, ...]:
         """Trajectories without the policy's noise, from starts that are the same for all policies of the run."""

@@ -83,7 +83,7 @@ class Cycle(Collection):
     def collect(self, state: LearnerState) -> Entry:
         """Steps 3 and 4: new trajectories, and which of them to ask about; `collected`."""
         began, restarted = time.perf_counter(), state.restarts(self.settings)
-        collected = self._collected(state, state.first_policy if restarted else state.policy)
+        collected = self._collected(state, state.first_policy if restarted else state.newest.policy)
         clips = self.settings.questions.clips(collected, rng=self._rng(CLIPS, state.iteration))
         known = (*state.compared, *clips_of(collected, clips))
         chosen = self._chosen_questions(state, known)
@@ -138,8 +138,8 @@ class Cycle(Collection):
     def _favourite(self, state: LearnerState) -> int:
         """The iteration that followed the kept policy; of one that was replaced at a restart, the last before."""
         if state.restart is None:
-            return state.best
-        kept, started = state.restart.number, state.started
+            return state.best.number
+        kept, started = state.restart.kept.number, state.started
         return kept if kept > started else min(kept, started - 1)
 
     def _of_iteration(self, number: int) -> range:
@@ -220,11 +220,11 @@ class Cycle(Collection):
         """
         if state.iteration == state.started:
             return Check(state.iteration, state.trust), None
-        newest = self._judged(utility, state.tried or self._tried(state.policy))
-        if state.best == state.started:
+        newest = self._judged(utility, state.newest.tried or self._tried(state.newest.policy))
+        if state.best.number == state.started:
             return Check(state.iteration, state.trust), newest
-        best = self._judged(utility, state.best_tried or self._tried(state.best_policy))
-        check = checked(median_differences(newest, best), newest=state.iteration, best=state.best, trust=state.trust)
+        best, number = self._judged(utility, state.best.tried or self._tried(state.best.policy)), state.best.number
+        check = checked(median_differences(newest, best), newest=state.iteration, best=number, trust=state.trust)
         return check, newest if check.best == state.iteration else best
 
     def _judged(self, utility: UtilityEstimate, tried: Sequence[Trajectory]) -> Float[np.ndarray, "s n"]:
@@ -248,9 +248,9 @@ class Cycle(Collection):
         if state.restart is None:
             return kept
         if not better:
-            tried = state.tried if check.best == state.iteration else state.best_tried
-        clearly = share_better(judged(utility, tried), judged(utility, state.restart.tried)) >= CLEARLY
-        return kept if clearly else state.restart.number
+            tried = (state.newest if check.best == state.iteration else state.best).tried
+        clearly = share_better(judged(utility, tried), judged(utility, state.restart.kept.tried)) >= CLEARLY
+        return kept if clearly else state.restart.kept.number
 
     def _confirmed(
         self, state: LearnerState, restart: Restart, utility: UtilityEstimate, tried: tuple[Trajectory, ...]
@@ -261,9 +261,9 @@ class Cycle(Collection):
         """
         answered = {past.newcomer for past in state.past if past.answer is not Answer.SKIP}
         asked = state.iteration > state.started and len(state.trajectories) - 1 in answered
-        kept, rival = restart.number, judged(utility, restart.tried)
+        kept, rival = restart.kept.number, judged(utility, restart.kept.tried)
         marks = {}
-        if asked and share_better(of_asked := judged(utility, state.tried), rival) >= CLEARLY:
+        if asked and share_better(of_asked := judged(utility, state.newest.tried), rival) >= CLEARLY:
             kept, rival, marks["confirmed"] = state.iteration, of_asked, True
         if share_better(judged(utility, tried), rival) >= POSSIBLY:
             marks["nominated"] = True
@@ -311,7 +311,7 @@ class Cycle(Collection):
             self.environment.action_space,
             quarters(taken) if needs_draws else None,
         )
-        policy = state.best_policy if check is not None and check.stepped_back else state.policy
+        policy = (state.best if check is not None and check.stepped_back else state.newest).policy
         proposed = propose(policy, problem, key=key, utility_draws=draws)
         usual, answers = settings.update.kl_bound, state.preferences.answers
         bound = schedules.decide(self.schedule, Situation(iteration + 1, answers, usual, utility, proposed))

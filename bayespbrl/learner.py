@@ -99,8 +99,7 @@ class Learner:
         )
         self.log: Log | None = None
         self.own_policy = None if own_policy is None else fitting(own_policy, *spaces)
-        first = self.first_policy()
-        self.state = events.replay(LearnerState(first, first, first), entries)
+        self.state = events.replay(LearnerState.begun(self.first_policy()), entries)
 
     def logged(self, log: Log) -> "Learner":
         """The same learner, with each further event appended to `log`."""
@@ -120,13 +119,13 @@ class Learner:
 
         One that was started anew replaces the policy before it only where it is clearly better.
         """
-        tried = self.state.tried or self.state.restart is not None
-        return greedy(self.state.kept_policy) if tried else self.state.kept_policy
+        tried, kept = self.state.newest.tried or self.state.restart is not None, self.state.kept.policy
+        return greedy(kept) if tried else kept
 
     @property
     def last_policy(self) -> Policy:
         """The newest policy, which the next trajectories follow."""
-        return self.state.policy
+        return self.state.newest.policy
 
     def first_policy(self) -> Policy:
         """The policy of the first trajectories: the user's own, or a random one."""

@@ -161,7 +161,7 @@ def test_names_without_who_gave_which_answer_are_refused():
 
 
 def test_nobody_has_answered_a_new_run_and_an_answer_without_a_name_is_somebodys():
-    assert LearnerState(*["policy"] * 3).preferences.answerers == ()
+    assert LearnerState.begun("policy").preferences.answerers == ()
     assert Preferences(answers=1).answerers == (None,)
 
 

@@ -99,14 +99,16 @@ def test_the_kept_policy_is_the_best_that_was_tried_and_its_value_is_reported(ru
         assert summary["kept"] in (before, number)
         assert summary["value"] == values[summary["kept"] - 1]
     utility = run.estimate.trajectory_utilities
-    tried, best_tried = (utility(some).mean() for some in (run.learner.state.tried, run.learner.state.best_tried))
+    tried, best_tried = (
+        utility(some).mean() for some in (run.learner.state.newest.tried, run.learner.state.best.tried)
+    )
     assert (kept[-1] == len(kept)) == (tried > best_tried)
     assert run.evaluate(episodes=300, seed=1) == pytest.approx(run.iterations[-1]["value"], abs=6.0)
-    assert run.learner.last_policy is run.learner.state.policy
+    assert run.learner.last_policy is run.learner.state.newest.policy
 
 
 def test_a_policy_is_tried_without_its_noise_from_starts_that_all_policies_share(run):
-    tried, kept = run.learner.state.tried, run.learner.state.best_tried
+    tried, kept = run.learner.state.newest.tried, run.learner.state.best.tried
     for trajectory, other in zip(tried, kept, strict=True):
         np.testing.assert_array_equal(trajectory.states[0], other.states[0])
     mode = jax.jit(run.last_policy.policy.mode)
@@ -127,7 +129,10 @@ def test_undo_takes_back_which_policies_were_tried_and_kept():
         undone.undo()  # after an iteration, from the second answer on
         undone.tell([ReturnExpert()(*query.trajectories) for query in questions])
     assert fingerprint(undone) == fingerprint(straight)
-    assert (undone.state.kept, undone.state.best) == (straight.state.kept, straight.state.best)
+    assert [undone.state.kept.number, undone.state.best.number] == [
+        straight.state.kept.number,
+        straight.state.best.number,
+    ]
 
 
 def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
@@ -157,33 +162,38 @@ def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
         np.testing.assert_array_equal(mine.actions, other.actions)
     checks = [summary["check"] for summary in restarted.iterations[began:]]
     assert [check["best"] for check in checks[:2]] == [began, began + 1]
-    assert restart.number == restarted.iterations[began - 1]["kept"]
+    assert restart.kept.number == restarted.iterations[began - 1]["kept"]
 
 
 def test_after_a_restart_the_kept_policy_gives_way_only_to_a_clearly_better_one(restarted):
     state, cycle_ = restarted.learner.state, restarted.learner.cycle
-    tried, check = state.tried, Check(state.best, 1.0)
-    of_best = cycle_._judged(state.estimate, state.best_tried)
+    tried, check = state.newest.tried, Check(state.best.number, 1.0)
+    of_best = cycle_._judged(state.estimate, state.best.tried)
     better = share_better(cycle_._judged(state.estimate, tried), of_best) >= CLEARLY
-    same = tried if better else state.best_tried
+    same = tried if better else state.best.tried
     for kept, expected in ((same, False), (worst_first(state, tried), True)):
-        before = replace(state, restart=replace(state.restart, tried=kept))
+        before = replace(state, restart=replace(state.restart, kept=replace(state.restart.kept, tried=kept)))
         number = cycle_._kept(before, state.estimate, check, of_best, tried)
-        assert (number != state.restart.number) == expected
-    if state.kept == state.restart.number:
-        assert restarted.learner.policy.policy is state.restart.policy
+        assert (number != state.restart.kept.number) == expected
+    if state.kept.number == state.restart.kept.number:
+        assert restarted.learner.policy.policy is state.restart.kept.policy
 
 
 @pytest.mark.parametrize("newest", [True, False])
 def test_after_a_restart_the_best_policy_is_judged_by_its_own_trajectories(restarted, newest):
     state, cycle_ = restarted.learner.state, restarted.learner.cycle
-    bad = worst_first(state, state.tried)
+    bad = worst_first(state, state.newest.tried)
     good = tuple(max(state.trajectories, key=lambda each: state.estimate.trajectory_utilities([each])[0]) for _ in bad)
-    restart = replace(state.restart, tried=tuple(state.trajectories[: len(bad)]))
-    of_the_two = {"tried": good, "best_tried": bad} if newest else {"tried": bad, "best_tried": good}
-    check = Check(state.iteration if newest else state.best, 1.0)
-    of_best = cycle_._judged(state.estimate, good)
-    kept = cycle_._kept(replace(state, restart=restart, **of_the_two), state.estimate, check, of_best, bad)
+    restart = replace(state.restart, kept=replace(state.restart.kept, tried=tuple(state.trajectories[: len(bad)])))
+    of_newest, of_best = (good, bad) if newest else (bad, good)
+    before = replace(
+        state,
+        restart=restart,
+        newest=replace(state.newest, tried=of_newest),
+        best=replace(state.best, tried=of_best),
+    )
+    check = Check(state.iteration if newest else state.best.number, 1.0)
+    kept = cycle_._kept(before, state.estimate, check, cycle_._judged(state.estimate, good), bad)
     assert kept == check.best
 
 
@@ -211,7 +221,7 @@ def test_a_restarted_run_that_was_stopped_or_undone_goes_on_bit_for_bit(restarte
         stopped.record(stopped.cycle.next(stopped.state))
     finished = bayespbrl.resume(tmp_path / "run", env=Slope()).run(expert)
     assert fingerprint(finished) == fingerprint(restarted.learner)
-    assert finished.state.kept == restarted.learner.state.kept
+    assert finished.state.kept.number == restarted.learner.state.kept.number
 
 
 @pytest.mark.parametrize("seed", [8, 11])
@@ -223,7 +233,7 @@ def test_policies_are_compared_without_noise_and_a_restarted_one_before_it_is_ke
         state, number = run.state, len(run.trajectories)
         if query[0].duel:
             assert (query[0].newcomer, query[0].incumbent) == (number - 1, number - 2)
-            duels.append((state.iteration, state.best if state.restart is None else state.restart.number))
+            duels.append((state.iteration, (state.best if state.restart is None else state.restart.kept).number))
             undominated = state.preferences.undominated
         run.tell([expert(*query[0].trajectories)])
         if query[0].duel:
@@ -241,8 +251,11 @@ def test_policies_are_compared_without_noise_and_a_restarted_one_before_it_is_ke
     assert max(before) <= 9  # a tenth is left
     confirmed = [newest for newest, _ in duels if newest > restart.iteration]
     assert confirmed
-    assert restart.number == run.state.kept
-    assert run.state.kept in (*confirmed, *(e["kept"] for e in run.iterations if e["iteration"] == restart.iteration))
+    assert restart.kept is run.state.kept
+    assert restart.kept.number in (
+        *confirmed,
+        *(e["kept"] for e in run.iterations if e["iteration"] == restart.iteration),
+    )
     assert fingerprint(replayed(run, log)) == fingerprint(run)
 
 
@@ -310,11 +323,11 @@ def test_a_run_of_an_earlier_version_which_tried_no_policy_goes_on(run, tmp_path
     (directory / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines[:last]))
     env = gymnasium.wrappers.TimeLimit(Slope(), 8)
     learner = bayespbrl.resume(directory, env=env)
-    best = learner.state.best
-    assert learner.policy is learner.state.best_policy
+    best = learner.state.best.number
+    assert learner.policy is learner.state.best.policy
     learner.run(ReturnExpert())
     assert learner.iterations[-1]["check"]["best"] in (best, learner.state.iteration - 1)
-    assert learner.policy is not learner.state.best_policy
+    assert learner.policy is not learner.state.best.policy
 
 
 @pytest.mark.slow
@@ -335,11 +348,11 @@ def test_after_a_step_back_the_update_begins_with_the_best_policy(run):
     before = replace(state, trajectories=state.trajectories[-20:])
 
     def updated(state, stepped_back):
-        improved, _ = cycle_.update(state, state.estimate, Check(state.best, 0.5, stepped_back))
+        improved, _ = cycle_.update(state, state.estimate, Check(state.best.number, 0.5, stepped_back))
         return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(improved.policy)]
 
     back = updated(before, True)
-    assert back == updated(replace(before, policy=state.best_policy), False)
+    assert back == updated(replace(before, newest=state.best), False)
     assert back != updated(before, False)
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bayespbrl.events import Entry, LearnerState, Restart, apply, plain, replay, surviving
+from bayespbrl.events import Entry, LearnerState, NumberedPolicy, Restart, apply, plain, replay, surviving
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.trajectories import Trajectory
 
@@ -41,7 +41,7 @@ def improved(iteration):
 
 
 UNDONE = Entry({"event": "undone"})
-START = LearnerState(*["policy 0"] * 3)
+START = LearnerState.begun("policy 0")
 # Two iterations by hand: 2 beats 0; 1 is worse than 2; then 4 ties with 2.
 HISTORY = (
     collected(1, [0, 2, 1], wanted=2),
@@ -63,7 +63,7 @@ def test_two_iterations_by_hand():
     assert state.preferences.undominated == (2, 4)
     assert state.preferences.answers == 3
     assert (state.iteration, state.queries, len(state.trajectories)) == (2, 3, 5)
-    assert (state.policy, state.estimate) == ("policy 2", "estimate 2")
+    assert (state.newest.policy, state.estimate) == ("policy 2", "estimate 2")
     assert state.summaries == (summary(1), summary(2))
     assert state.bound == Bound(kl_bound=0.5, reason="confidence", signal=0.25, statistics={"gain": 0.25})
     assert (state.collected, state.query, state.candidates, state.wanted) == (False, None, (), 0)
@@ -75,7 +75,7 @@ def test_the_learner_reads_what_an_update_decided_and_never_its_summary():
     fields = {"check": check, "kept": 1, "bound": bound, "value": 7.0}
     entries = (*HISTORY[:-1], Entry({**HISTORY[-1].event, **fields}, HISTORY[-1].parts))
     state = replay(START, entries)
-    assert (state.bound, state.kept, state.best, state.trust) == (Bound(**bound), 1, 1, 0.5)
+    assert (state.bound, state.kept.number, state.best.number, state.trust) == (Bound(**bound), 1, 1, 0.5)
     assert state.values == (0.5, 7.0)  # the first by a log of an earlier version
     assert state.summaries == (summary(1), summary(2))
 
@@ -121,13 +121,14 @@ def test_a_policy_is_started_anew_once_and_what_was_kept_is_remembered():
     anew = collected(3, [5], seed=2)
     anew = dataclasses.replace(anew, event={**anew.event, "restarted": True})
     state = replay(START, (*HISTORY, anew))
-    assert (state.policy, state.started, state.best, state.tried, state.trust) == ("policy 0", 2, 2, (), 1.0)
-    assert (state.kept, state.kept_policy, state.restart) == (2, "policy 2", Restart(2, 2, "policy 2", ()))
+    first, kept = NumberedPolicy(2, "policy 0"), NumberedPolicy(2, "policy 2")
+    assert (state.newest, state.best, state.started, state.trust) == (first, first, 2, 1.0)
+    assert (state.kept, state.restart) == (kept, Restart(2, kept))
     checked = {"check": {"best": 2, "trust": 1.0}}
     for kept, policy in ((3, "policy 3"), (2, "policy 2")):
         update = improved(3)
         update.event["summary"].update(checked, kept=kept)
-        assert apply(state, update).kept_policy == policy
+        assert apply(state, update).kept.policy == policy
     first, again = (dataclasses.replace(anew, event={**anew.event, "iteration": number}) for number in (1, 4))
     for history in ((first,), (*HISTORY, anew, improved(3), again)):
         with pytest.raises(ValueError, match="collected: expected at most one restart"):
@@ -155,7 +156,18 @@ def test_undoing_leads_to_the_state_before_the_last_answer(length):
     last = max(i for i, entry in enumerate(HISTORY[:length]) if entry.event["event"] == "answered")
     undone, never = replay(START, (*HISTORY[:length], UNDONE)), replay(START, HISTORY[:last])
     assert undone.query.number == never.query.number
-    names = ("policy", "estimate", "bound", "iteration", "preferences", "candidates", "wanted", "queries", "summaries")
+    names = (
+        "newest",
+        "kept",
+        "estimate",
+        "bound",
+        "iteration",
+        "preferences",
+        "candidates",
+        "wanted",
+        "queries",
+        "summaries",
+    )
     for name in names:
         assert getattr(undone, name) == getattr(never, name)
     assert len(undone.trajectories) == len(never.trajectories)

@@ -17,7 +17,7 @@ from bayespbrl import Answer, Learner, ReturnExpert, events, load, queries, ques
 from bayespbrl import cycle as cycle_module
 from bayespbrl.diagnostics.estimates import predicted_answer
 from bayespbrl.envs.gridworld import REWARDS
-from bayespbrl.events.state import LearnerState, Restart
+from bayespbrl.events.state import LearnerState, NumberedPolicy, Restart
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.improvement.update import NEARLY
 from bayespbrl.models import restored, stored
@@ -839,8 +839,9 @@ def test_the_trajectories_of_a_policy_without_a_mode_are_not_shown_as_if_they_ha
 )
 def test_the_favourite_of_a_start_is_of_the_iteration_that_followed_the_kept_policy(started, kept, followed):
     # at a restart after eight iterations the eighth policy was followed by none; one since then may be confirmed
-    restart = None if started is None else Restart(started, kept, "policy", ())
-    state = LearnerState(*["policy"] * 3, best=kept if restart is None else 9, restart=restart)
+    policy, best = NumberedPolicy(kept, "policy"), NumberedPolicy(9, "policy")
+    restart = None if started is None else Restart(started, policy)
+    state = LearnerState("policy", best, policy if restart is None else best, policy, restart=restart)
     assert learner().cycle._favourite(state) == followed
 
 

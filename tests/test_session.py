@@ -45,7 +45,7 @@ from bayespbrl.runs.lock import continuing
 from bayespbrl.trajectories import Trajectory
 
 WAIT = 120  # seconds at most
-NO_POLICIES = [None] * 3
+NO_POLICIES = [None] * 4
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from bayespbrl.envs import SHORT_NAMES
-from bayespbrl.events import LearnerState, Restart
+from bayespbrl.events import LearnerState, NumberedPolicy, Restart
 from bayespbrl.settings import OPTIONS, Settings, settings_for
 from bayespbrl.settings.presets import DEFAULT, IDS, PAPER, TASKS
 from bayespbrl.settings.tasks import Task
@@ -252,7 +252,7 @@ def test_a_tenth_of_the_answers_is_left_for_a_policy_that_is_started_anew(answer
     assert settings_for("SomebodysEnv-v3", task=TASK, answers=answers, restart_iterations=0).confirmations == 0
     # beyond its last iteration a run goes on while its newest policy is to be asked about and an answer is left for it
     last = settings.last_iteration(20)
-    state = LearnerState(*["policy"] * 3, restart=Restart(20, 15, "policy", ()), nominated=True)
+    state = replace(LearnerState.begun("policy"), restart=Restart(20, NumberedPolicy(15, "policy")), nominated=True)
     for beyond in range(-1, 8):
         reached = replace(state, iteration=last + beyond)
         assert reached.left(settings) == answers

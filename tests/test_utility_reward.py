@@ -175,8 +175,8 @@ def test_predict_takes_one_observation_or_many(request, task):
 
 def test_the_deterministic_action_is_the_mean_or_the_most_probable(pendulum, cartpole):
     one, _ = gymnasium.make("CartPole-v1").reset(seed=1)
-    probabilities = cartpole.learner.state.kept_policy.probabilities(one[None])
+    probabilities = cartpole.learner.state.kept.policy.probabilities(one[None])
     assert cartpole.policy.predict(one, deterministic=True)[0] == probabilities.argmax()
     one, _ = gymnasium.make("Pendulum-v1").reset(seed=1)
-    samples = np.array([pendulum.learner.state.kept_policy.mean_and_variance(one[None].astype(float))[0][0]])
+    samples = np.array([pendulum.learner.state.kept.policy.mean_and_variance(one[None].astype(float))[0][0]])
     assert pendulum.policy.predict(one, deterministic=True)[0] == pytest.approx(np.clip(samples[0], -2, 2))

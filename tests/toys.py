@@ -105,7 +105,7 @@ def fingerprint(learner):
         "policy": [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(learner.policy)],
         "trajectories": [
             (t.states.tobytes(), t.actions.tobytes(), t.rewards.tobytes(), t.terminated)
-            for t in (*learner.trajectories, *learner.state.tried, *learner.state.best_tried)
+            for t in (*learner.trajectories, *learner.state.newest.tried, *learner.state.best.tried)
         ],
         "preferences": learner.preferences,
         "weights": None if learner.estimate is None else np.asarray(learner.estimate.weights).tobytes(),

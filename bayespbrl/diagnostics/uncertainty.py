@@ -116,7 +116,7 @@ def q_draws(learner: Learner, states: ArrayLike, actions: ArrayLike, *, number: 
     steps = transitions(learner.trajectories)
     _, draws = fit.utilities_and_draws(steps.next_states, number=number, actions=steps.actions)
     q = estimate_q(
-        learner.state.kept_policy,
+        learner.state.kept.policy,
         CriticData(steps, draws.T),
         key=jax.random.key(seed),
         action_space=learner.environment.action_space,

@@ -32,13 +32,14 @@ from bayespbrl.events.entry import (
     undone,
 )
 from bayespbrl.events.fold import apply, replay
-from bayespbrl.events.state import LearnerState, Restart
+from bayespbrl.events.state import LearnerState, NumberedPolicy, Restart
 
 __all__ = [
     "MOST_REPLAYS",
     "Entry",
     "LearnerState",
     "Log",
+    "NumberedPolicy",
     "Restart",
     "answered",
     "apply",

@@ -7,7 +7,7 @@ from typing import Any
 
 from bayespbrl import checks
 from bayespbrl.events.entry import Entry, checked_about, clips_in, has_figures
-from bayespbrl.events.state import LearnerState, Restart
+from bayespbrl.events.state import LearnerState, NumberedPolicy, Restart
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.preferences import Answer, PastQuestion, Query, parse_answer
 
@@ -64,22 +64,21 @@ def _improved(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str,
     check = found["check"]  # of a checked update
     best = iteration if check is None else operator.index(check["best"])
     kept = best if found["kept"] is None else operator.index(found["kept"])
-    if check is not None and best not in (state.best, state.iteration):
-        raise ValueError(f"improved: expected {state.best} or {state.iteration} as the best, got {best}")
+    if check is not None and best not in (state.best.number, state.iteration):
+        raise ValueError(f"improved: expected {state.best.number} or {state.iteration} as the best, got {best}")
     restart, confirmed = state.restart, event.get("confirmed", False)
     if confirmed and restart is not None:
-        restart = replace(restart, number=state.iteration, policy=state.policy, tried=state.tried)
-    if kept not in (best, iteration, *(() if restart is None else (restart.number,))):
+        restart = replace(restart, kept=state.newest)
+    newest = NumberedPolicy(iteration, parts["policy"], tuple(parts.get("tried", ())))
+    of_best = newest if check is None else state.newest if best == state.iteration else state.best
+    choice = {best: of_best, iteration: newest} | ({} if restart is None else {restart.kept.number: restart.kept})
+    if kept not in choice:
         raise ValueError(f"improved: expected policy {best} or {iteration} to be kept, got {kept}")
-    last_is_best = best == state.iteration
     return replace(
         state,
-        policy=parts["policy"],
-        best_policy=state.policy if last_is_best else state.best_policy,
-        best=best,
-        kept=kept,
-        tried=tuple(parts.get("tried", ())),
-        best_tried=state.tried if last_is_best else state.best_tried,
+        newest=newest,
+        best=of_best,
+        kept=choice[kept],
         trust=1.0 if check is None else float(check["trust"]),
         restart=restart,
         nominated=restart is not None and event.get("nominated", False) is True,
@@ -119,21 +118,12 @@ def _collected(state: LearnerState, event: Mapping[str, Any], parts: Mapping[str
     if not preferences.undominated and opponents is None:
         preferences, candidates = preferences.start(candidates[0]), candidates[1:]
     if event.get("restarted", False):
-        if state.restart is not None or not state.kept:
+        if state.restart is not None or not state.kept.number:
             raise ValueError(
                 f"collected: expected at most one restart, of a run that keeps a policy, got {event['iteration']}"
             )
-        kept = Restart(state.iteration, state.kept, state.kept_policy, state.kept_tried)
-        state = replace(
-            state,
-            policy=state.first_policy,
-            best=state.iteration,
-            best_policy=state.first_policy,
-            tried=(),
-            best_tried=(),
-            trust=1.0,
-            restart=kept,
-        )
+        first, restart = NumberedPolicy(state.iteration, state.first_policy), Restart(state.iteration, state.kept)
+        state = replace(state, newest=first, best=first, trust=1.0, restart=restart)
     return replace(
         state,
         trajectories=state.trajectories + tuple(parts["trajectories"]),

@@ -13,19 +13,31 @@ from bayespbrl.utility.estimate import UtilityEstimate
 
 
 @dataclass(frozen=True)
+class NumberedPolicy:
+    """A policy of the run.
+
+    Attributes:
+      number: of the iterations before it.
+      policy: itself.
+      tried: its trajectories without its noise, where updates are checked; () where there are none.
+    """
+
+    number: int
+    policy: Policy
+    tried: tuple[Trajectory, ...] = ()
+
+
+@dataclass(frozen=True)
 class Restart:
     """A restart of the policy.
 
     Attributes:
       iteration: iterations completed by then.
-      number, policy, tried: of the policy that the run kept by then, or of a restarted one that an answer confirmed
-        since: its number, and its trajectories without noise.
+      kept: the policy that the run kept by then, or a restarted one that an answer confirmed since.
     """
 
     iteration: int
-    number: int
-    policy: Policy
-    tried: tuple[Trajectory, ...]
+    kept: NumberedPolicy
 
 
 @dataclass(frozen=True)
@@ -33,15 +45,12 @@ class LearnerState:
     """The learner's state between two calls.
 
     Attributes:
-      policy: the newest policy, which the next trajectories follow unless the policy is started anew.
       first_policy: the one that a policy started anew begins with.
-      best_policy: where updates are checked, the one that the posterior thinks best of the policies before the newest,
-        the first before the second update; the next update starts there after a step back.
-      best: the number of the best policy, that is of the iterations before it; since a restart, where there was one.
-      kept: the number of the policy that the run keeps: the best or, if the posterior prefers it, the newest; after a
-        restart that kept before it, unless one of these is clearly better.
-      tried, best_tried: trajectories of the newest and of the best policy without their noise, where updates are
-        checked; () where there are none.
+      newest: the policy that the next trajectories follow, unless the policy is started anew.
+      best: where updates are checked, the policy that the posterior thinks best of those before the newest, since a
+        restart if there was one; the first before the second update. The next update starts there after a step back.
+      kept: the policy that the run keeps: the best or, if the posterior prefers it, the newest; after a restart that
+        kept before it, unless one of these is clearly better.
       trust: share of the KL bound that the next update may use; it falls after a step back.
       restart: when the policy was started anew, and what was kept by then, or by an answer since; None: it was not.
       nominated: whether the newest policy, started anew, is to be asked about, because it may be better than that one.
@@ -67,13 +76,10 @@ class LearnerState:
       before: the states before the last answers, at most `MOST_UNDONE`, the newest last; they have none themselves.
     """
 
-    policy: Policy
     first_policy: Policy
-    best_policy: Policy
-    best: int = 0
-    kept: int = 0
-    tried: tuple[Trajectory, ...] = ()
-    best_tried: tuple[Trajectory, ...] = ()
+    newest: NumberedPolicy
+    best: NumberedPolicy
+    kept: NumberedPolicy
     trust: float = 1.0
     restart: Restart | None = None
     nominated: bool = False
@@ -96,6 +102,12 @@ class LearnerState:
     shown: frozenset[int] = frozenset()
     summaries: tuple[Mapping[str, Any], ...] = ()
     before: tuple["LearnerState", ...] = field(default=(), repr=False)
+
+    @classmethod
+    def begun(cls, policy: Policy) -> "LearnerState":
+        """Before the first event, with the first policy."""
+        first = NumberedPolicy(0, policy)
+        return cls(policy, first, first, first)
 
     def finished(self, settings: Settings) -> bool:
         """Whether a run with these settings ends here: after an iteration, not within one.
@@ -167,17 +179,3 @@ class LearnerState:
     def compared(self) -> tuple[Trajectory, ...]:
         """What questions are about, by the numbers of the trajectories: the trajectories, or a part of each."""
         return clips_of(self.trajectories, self.clips or None)
-
-    @property
-    def kept_policy(self) -> Policy:
-        """The policy number `kept`."""
-        if self.restart is not None and self.kept == self.restart.number:
-            return self.restart.policy
-        return self.policy if self.kept == self.iteration else self.best_policy
-
-    @property
-    def kept_tried(self) -> tuple[Trajectory, ...]:
-        """Trajectories of the policy number `kept` without its noise; () where it was not tried."""
-        if self.restart is not None and self.kept == self.restart.number:
-            return self.restart.tried
-        return self.tried if self.kept == self.iteration else self.best_tried

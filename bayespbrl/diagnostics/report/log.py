@@ -115,7 +115,7 @@ def _applied(
     """The learner's state without its heavy parts, and the answers."""
     # stand-ins: applying an event only needs the heavy parts to be there
     none = cast(Policy, None)
-    state, answers = LearnerState(none, none, none), []
+    state, answers = LearnerState.begun(none), []
     parts = {"trajectories": [None] * settings.rollouts.trajectories_per_iteration, "policy": None, "estimate": None}
     clips: list[tuple[int, int]] = []
     for event in log:
