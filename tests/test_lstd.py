@@ -1,5 +1,8 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import scipy.sparse
 
 from bayespbrl.improvement.lstd import solve_lstd, transition_sums
 
@@ -121,3 +124,35 @@ def test_bad_input_is_named(changes, message):
     arguments = {"utilities": np.ones(3), "discount": 0.5, **NO_PENALTY} | changes
     with pytest.raises(ValueError, match=message):
         lstd(features, following, **arguments)
+
+
+@pytest.mark.slow
+def test_the_sparse_sums_of_a_large_table_have_the_weights_of_the_dense_ones():
+    rng = np.random.default_rng(1)
+    pairs, tried = 1200, 900  # the other pairs are never tried, but their values are those of next states
+    rows, successors = rng.integers(tried, size=3000), rng.integers(pairs, size=(3000, 2))
+    features, following = np.zeros((3000, pairs + 1)), np.zeros((3000, pairs + 1))
+    features[np.arange(3000), rows] = 1.0
+    for column, chance in zip(successors.T, (0.7, 0.3), strict=True):
+        following[np.arange(3000), column] += chance
+    features[:, -1] = following[:, -1] = 1.0  # the bias
+    following[rng.random(3000) < 0.01] = 0.0
+    utilities = np.column_stack([rng.normal(size=pairs)[rows], rng.normal(size=3000)])
+    sums = transition_sums(features, following, utilities)
+    assert scipy.sparse.issparse(sums.gram)
+    dense = replace(sums, gram=features.T @ features, cross=features.T @ following)
+    np.testing.assert_allclose(sums.gram.toarray(), dense.gram)
+    options = {"discount": 0.98, "fixed_point_ridge": 1e-3, "projection_ridge": 1e-3}
+    expected = solve_lstd(dense, **options)
+    np.testing.assert_allclose(solve_lstd(sums, **options), expected, atol=1e-6 * np.abs(expected).max())
+    halves = [
+        transition_sums(features[part], following[part], utilities[part]) for part in (slice(1500), slice(1500, None))
+    ]
+    np.testing.assert_allclose(solve_lstd(halves[0] + halves[1], **options), solve_lstd(sums, **options), atol=1e-7)
+    unpenalised = options | {"fixed_point_ridge": 0.0}
+    np.testing.assert_allclose(solve_lstd(sums, **unpenalised), solve_lstd(dense, **unpenalised))
+
+
+def test_wide_features_that_are_not_sparse_are_summed_as_they_are():
+    features = np.random.default_rng(2).normal(size=(20, 1000))
+    assert isinstance(transition_sums(features, features, np.ones(20)).gram, np.ndarray)

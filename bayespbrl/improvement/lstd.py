@@ -1,14 +1,23 @@
 """Least-squares temporal differences (Boyan 1999), ℓ2–ℓ2 regularised (paper, step 2: estimating the Q-function)."""
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from bayespbrl import checks
 
 Targets = Float[np.ndarray, " q"] | Float[np.ndarray, "q n"]  # of one utility, or of n side by side
+SparseArray = Any  # a `scipy.sparse.csr_array`, which has no types
+Gram = Float[np.ndarray, "q q"] | SparseArray
+# From so many features on, sums that are nearly all zero are kept as sparse arrays: those of the pairs of a large table
+# of states and actions, whose dense algebra takes ten seconds a solution with 3000 pairs.
+WIDE = 1000
+MOST_FILLED = 0.02  # share of the features that are not zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,9 +30,14 @@ class TransitionSums:
       target: Φᵀu.
     """
 
-    gram: Float[np.ndarray, "q q"]
-    cross: Float[np.ndarray, "q q"]
+    gram: Gram
+    cross: Gram
     target: Targets
+
+    @property
+    def features(self) -> int:
+        """Q."""
+        return int(self.gram.shape[0])
 
     def __add__(self, other: "TransitionSums") -> "TransitionSums":
         return TransitionSums(self.gram + other.gram, self.cross + other.cross, self.target + other.target)
@@ -51,11 +65,18 @@ def transition_sums(features: ArrayLike, next_features: ArrayLike, utilities: Ar
             "transitions: expected features and next_features (N, Q) and utilities (N,) or (N, n), got "
             f"{features.shape}, {next_features.shape} and {utilities.shape}"
         )
+    if _wide_and_empty(features) and _wide_and_empty(next_features):
+        rows, next_rows = sparse.csr_array(features), sparse.csr_array(next_features)
+        return TransitionSums((rows.T @ rows).tocsr(), (rows.T @ next_rows).tocsr(), rows.T @ utilities)
     return TransitionSums(features.T @ features, features.T @ next_features, features.T @ utilities)
 
 
+def _wide_and_empty(features: Float[np.ndarray, "n q"]) -> bool:
+    return features.shape[1] >= WIDE and bool(np.count_nonzero(features) <= MOST_FILLED * features.size)
+
+
 def solve_lstd(sums: TransitionSums, *, discount: float, fixed_point_ridge: float, projection_ridge: float) -> Targets:
-    """Weights θ of Q(s, a) = φ(s, a)ᵀθ by regularised least-squares temporal differences, O(Q³).
+    """Weights θ of Q(s, a) = φ(s, a)ᵀθ by regularised least-squares temporal differences, O(Q³) where not sparse.
 
     With G = ΦᵀΦ and P = (G + β₂I)⁻¹ the projection is Σ = PΦᵀ, so that X = Φ − γΦΣΦ′ = ΦM with
     M = I − γPΦᵀΦ′, and everything follows from two Gram matrices: nothing N × N is formed.
@@ -76,8 +97,12 @@ def solve_lstd(sums: TransitionSums, *, discount: float, fixed_point_ridge: floa
     checks.non_negative("fixed_point_ridge", fixed_point_ridge)
     checks.non_negative("projection_ridge", projection_ridge)
     gram, cross, target = sums.gram, sums.cross, sums.target
-    if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross)) and np.all(np.isfinite(target))):
+    known = [each.data if sparse.issparse(each) else each for each in (gram, cross, target)]
+    if not all(np.all(np.isfinite(each)) for each in known):
         raise ValueError("transitions: expected finite features and utilities, got NaN or infinity")
+    if sparse.issparse(gram) and sparse.issparse(cross) and fixed_point_ridge and projection_ridge:
+        return _solve_sparse(gram, discount * cross, target, fixed_point_ridge, projection_ridge)
+    gram, cross = _dense(gram), _dense(cross)
     size = len(gram)
     # Hoffman et al. (2012), ℓ2–ℓ2, with Σ = PΦᵀ: P[ΦᵀΦ′, Φᵀu]
     projected = _solve_symmetric(gram, projection_ridge, np.column_stack([cross, target]))
@@ -86,6 +111,30 @@ def solve_lstd(sums: TransitionSums, *, discount: float, fixed_point_ridge: floa
     projected_target = projected[:, size] if target.ndim == 1 else projected[:, size:]
     # Hoffman et al. (2012), ℓ2–ℓ2: θ = (XᵀX + β₁I)⁻¹XᵀΦΣu
     return _solve_symmetric(normal, fixed_point_ridge, mixing.T @ (gram @ projected_target))
+
+
+def _dense(matrix: Gram) -> Float[np.ndarray, "q q"]:
+    return np.asarray(cast(SparseArray, matrix).toarray() if sparse.issparse(matrix) else matrix)
+
+
+def _solve_sparse(
+    gram: SparseArray, discounted: SparseArray, target: Targets, fixed_point_ridge: float, ridge: float
+) -> Targets:
+    """The same θ as the minimum of ½‖Φ(θ − w)‖² + ½β₁‖θ‖² with (G + β₂I)w = Φᵀu + γΦᵀΦ′θ, all of it sparse.
+
+    With multipliers λ of the constraint the conditions for the minimum are linear in (θ, w, λ).
+    """
+    size = gram.shape[0]
+    eye = sparse.eye_array(size)
+    projecting = gram + ridge * eye
+    conditions = [
+        [gram + fixed_point_ridge * eye, -gram, -discounted.T],
+        [-gram, gram, projecting],
+        [-discounted, projecting, None],
+    ]
+    factors = splu(sparse.block_array(conditions).tocsc())
+    weights: Targets = factors.solve(np.concatenate([np.zeros((2 * size, *target.shape[1:])), target]))[:size]
+    return weights
 
 
 def _solve_symmetric(matrix: Float[np.ndarray, "q q"], ridge: float, right: Targets) -> Targets:
