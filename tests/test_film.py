@@ -8,6 +8,8 @@ from PIL import Image
 
 from bayespbrl import Learner
 from bayespbrl.envs import pictures
+from bayespbrl.envs.opening import open_environment
+from bayespbrl.runs import film
 from bayespbrl.runs.film import FRAMES, film_policy
 
 QUICK = {
@@ -69,9 +71,9 @@ def frames_of(path):
 @pytest.mark.slow
 def test_an_environment_that_can_be_drawn_leaves_a_film_and_a_strip(tmp_path, monkeypatch):
     monkeypatch.setattr("bayespbrl.runs.film.FRAMES", 6)  # each takes a tenth of a second
-    film, strip = film_policy(Learner("gridworld", max_steps=20, **QUICK), tmp_path)
-    assert (film, strip) == (tmp_path / "final.gif", tmp_path / "final.png")
-    with Image.open(film) as image:
+    gif, strip = film_policy(Learner("gridworld", max_steps=20, **QUICK), tmp_path)
+    assert (gif, strip) == (tmp_path / "final.gif", tmp_path / "final.png")
+    with Image.open(gif) as image:
         assert 2 <= image.n_frames <= 6
     with Image.open(strip) as image:
         assert image.format == "PNG"
@@ -80,8 +82,8 @@ def test_an_environment_that_can_be_drawn_leaves_a_film_and_a_strip(tmp_path, mo
 @pytest.mark.parametrize("env", ["bayespbrl-tests/Counter-v0", Counter("rgb_array")])
 def test_an_environment_that_renders_itself_is_filmed_step_by_step(tmp_path, env):
     learner = Learner(env, max_steps=9, **QUICK)
-    film, strip = film_policy(learner, tmp_path)
-    shown = frames_of(film)
+    gif, strip = film_policy(learner, tmp_path)
+    shown = frames_of(gif)
     assert [brightness for brightness, _ in shown] == list(range(8))  # the reset and seven steps
     assert [milliseconds for _, milliseconds in shown] == [50] * 7 + [1500]
     with Image.open(strip) as image:
@@ -119,6 +121,23 @@ def test_an_environment_that_cannot_be_rendered_is_named_and_nothing_is_written(
     with pytest.raises(ValueError, match=reason):
         film_policy(Learner(env, max_steps=9, **QUICK), tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("platform", "variables", "expected"),
+    [
+        ("linux", {}, "egl"),
+        ("linux", {"MUJOCO_GL": "osmesa"}, "osmesa"),
+        ("linux", {"DISPLAY": ":0"}, None),
+        ("linux", {"WAYLAND_DISPLAY": "wayland-0"}, None),
+        ("darwin", {}, None),
+    ],
+)
+def test_mujoco_is_asked_to_render_without_a_display_where_there_is_none(monkeypatch, platform, variables, expected):
+    monkeypatch.setattr(film.os, "environ", dict(variables))
+    monkeypatch.setattr(film.sys, "platform", platform)
+    film.rendering(open_environment("bayespbrl-tests/Counter-v0"), 9).close()
+    assert film.os.environ.get("MUJOCO_GL") == expected
 
 
 def test_a_contact_sheet_shows_first_and_last_and_leaves_the_rest_white(tmp_path):

@@ -1,5 +1,7 @@
 """Films of a policy: one fresh episode as an animated GIF and as a film strip."""
 
+import os
+import sys
 from pathlib import Path
 
 import gymnasium
@@ -91,7 +93,8 @@ def _rendered(learner: Learner) -> tuple[np.ndarray, float]:
 def rendering(environment: gymnasium.Env, limit: int) -> gymnasium.Env:
     """The environment in a mode that renders: made again where its name says how, else the user's object.
 
-    Copies of what has a name end after `limit` steps, as in the rollouts.
+    Copies of what has a name end after `limit` steps, as in the rollouts. On Linux without a display MuJoCo is asked to
+    render by EGL, unless the environment variable `MUJOCO_GL` says otherwise.
 
     Raises:
       ValueError: it has no mode `rgb_array`, or is an object in another mode.
@@ -107,6 +110,8 @@ def rendering(environment: gymnasium.Env, limit: int) -> gymnasium.Env:
     if "rgb_array" not in modes:
         raise ValueError(f"expected a mode rgb_array, got {', '.join(modes) or 'none'}")
     own = limit if made_from(environment) is not None else None
+    if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("WAYLAND_DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's way to render without a display
     return flattened(gymnasium.make(spec, max_episode_steps=own, render_mode="rgb_array"))
 
 
