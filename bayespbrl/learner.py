@@ -98,7 +98,8 @@ class Learner:
             checks.function_or_name("query", query, self.settings.questions.query, QUERY_RULES),
         )
         self.log: Log | None = None
-        self.own_policy = None if own_policy is None else fitting(own_policy, *spaces)
+        noise_free = kept is None and self.settings.rollouts.noise_free
+        self.own_policy = None if own_policy is None else fitting(own_policy, *spaces, noise_free=noise_free)
         self.state = events.replay(LearnerState.begun(self.first_policy()), entries)
 
     def logged(self, log: Log) -> "Learner":

@@ -157,7 +157,7 @@ def test_a_modules_first_line_says_what_it_is():
         assert path.read_text().startswith('"""'), module
 
 
-def test_a_package_of_several_modules_names_each_of_them_and_no_other():
+def test_a_package_of_several_modules_mentions_each_of_them_and_lists_no_other():
     for package in ROOT.rglob("__init__.py"):
         rooms = {path.stem for path in package.parent.glob("*.py")} - {"__init__"}
         overview = ast.get_docstring(ast.parse(package.read_text())) or ""

@@ -136,6 +136,11 @@ def test_an_environment_that_cannot_be_rendered_is_named_and_nothing_is_written(
 def test_mujoco_is_asked_to_render_without_a_display_where_there_is_none(monkeypatch, platform, variables, expected):
     monkeypatch.setattr(film.os, "environ", dict(variables))
     monkeypatch.setattr(film.sys, "platform", platform)
+    if expected:  # other environments are rendered without it
+        monkeypatch.delitem(film.sys.modules, "mujoco", raising=False)
+        film.rendering(open_environment("bayespbrl-tests/Counter-v0"), 9).close()
+        assert film.os.environ == variables
+    monkeypatch.setitem(film.sys.modules, "mujoco", None)
     film.rendering(open_environment("bayespbrl-tests/Counter-v0"), 9).close()
     assert film.os.environ.get("MUJOCO_GL") == expected
 

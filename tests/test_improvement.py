@@ -506,5 +506,5 @@ def test_the_critic_takes_the_last_iterations_but_neither_too_few_nor_too_many_t
     assert taken([10] * 20, 4) == 20  # 5000 are not there yet
     assert taken([100] * 200, 4) == 50
     assert taken([900] * 200, 100) == 11  # 10 000 at most
-    assert taken([3000] * 20, 4) == 8  # but ten trajectories, the last of which may be without noise
-    assert taken([20_000] * 20, 10) == 10
+    assert taken([3000] * 20, 4) == 6  # but six trajectories, the last of which may be without noise
+    assert taken([20_000] * 20, 2) == 4

@@ -832,6 +832,8 @@ def test_the_trajectories_of_a_policy_without_a_mode_are_not_shown_as_if_they_ha
     for kind, expected in ((LinearGaussianPolicy, True), (WithoutMode, False)):
         settings = Learner("Pendulum-v1", policy=kind.initial(*spaces, initial_scale=0.5)).settings
         assert (settings.rollouts.noise_free, settings.questions.against_kept) == (expected, expected)
+    with pytest.raises(ValueError, match="policy: expected one with a mode because of noise_free, got a WithoutMode"):
+        Learner("Pendulum-v1", policy=WithoutMode.initial(*spaces), noise_free=True)
 
 
 @pytest.mark.parametrize(

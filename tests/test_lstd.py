@@ -149,10 +149,26 @@ def test_the_sparse_sums_of_a_large_table_have_the_weights_of_the_dense_ones():
         transition_sums(features[part], following[part], utilities[part]) for part in (slice(1500), slice(1500, None))
     ]
     np.testing.assert_allclose(solve_lstd(halves[0] + halves[1], **options), solve_lstd(sums, **options), atol=1e-7)
-    unpenalised = options | {"fixed_point_ridge": 0.0}
-    np.testing.assert_allclose(solve_lstd(sums, **unpenalised), solve_lstd(dense, **unpenalised))
+    mixed = halves[0] + transition_sums(np.eye(5, pairs + 1), np.eye(5, pairs + 1), np.ones((5, 2)))
+    together = halves[0].gram.toarray() + np.diag(np.arange(pairs + 1) < 5)
+    np.testing.assert_allclose(mixed.gram.toarray() if scipy.sparse.issparse(mixed.gram) else mixed.gram, together)
+    for ridge in (0.0, 1e-20):  # too small for the sparse solution
+        barely = {"discount": 0.98, "fixed_point_ridge": ridge, "projection_ridge": 1e-3}
+        np.testing.assert_allclose(solve_lstd(sums, **barely), solve_lstd(dense, **barely), rtol=1e-9)
 
 
-def test_wide_features_that_are_not_sparse_are_summed_as_they_are():
-    features = np.random.default_rng(2).normal(size=(20, 1000))
-    assert isinstance(transition_sums(features, features, np.ones(20)).gram, np.ndarray)
+@pytest.mark.parametrize("filled", [1.0, 0.015])  # of the second the sums are not sparse
+def test_wide_features_whose_sums_are_not_sparse_are_summed_as_they_are(filled):
+    rng = np.random.default_rng(2)
+    features = rng.normal(size=(800, 1000)) * (rng.random((800, 1000)) < filled)
+    sums = transition_sums(features, features, np.ones(800))
+    np.testing.assert_array_equal(sums.gram, features.T @ features)
+
+
+def test_sums_that_are_singular_are_solved_as_dense_ones():
+    features = np.zeros((1, 1000))
+    sums = transition_sums(features, features, np.ones(1))
+    assert scipy.sparse.issparse(sums.gram)
+    np.testing.assert_array_equal(
+        solve_lstd(sums, discount=0.0, fixed_point_ridge=1e-320, projection_ridge=1e-320), 0.0
+    )

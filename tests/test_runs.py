@@ -712,6 +712,28 @@ def test_features_that_are_lists_or_of_single_precision_give_the_same_utilities_
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Corner:
+    """Features of a user's own that could be stored as the package's are."""
+
+    size: int
+
+    def __call__(self, states):
+        return np.column_stack([states // self.size, states % self.size]).astype(float)
+
+
+@pytest.mark.parametrize("features", [Corner(5), OneHot(25)], ids=["own", "ours"])
+def test_features_that_are_a_dataclass_are_the_users_own_and_passed_again(tmp_path, features):
+    learner = start(tmp_path / "run", features=features)
+    for _ in range(2):
+        learner.tell([ReturnExpert()(*learner.ask()[0].trajectories)])
+    with pytest.raises(ValueError, match="features"):
+        bayespbrl.load(tmp_path / "run")
+    loaded = bayespbrl.load(tmp_path / "run", features=features)
+    np.testing.assert_array_equal(loaded.estimate.utilities(np.arange(25)), learner.estimate.utilities(np.arange(25)))
+    assert runs.resume(tmp_path / "run", features=features).run(ReturnExpert()).finished
+
+
 def test_features_for_a_run_that_has_none_are_refused(finished):
     with pytest.raises(ValueError, match=r"expected no features=, got <function"):
         bayespbrl.load(finished, features=rows)

@@ -36,7 +36,7 @@ def compare_likelihoods(
       groups: the number of the answer that each row follows from, shape (K,), never decreasing: rows of one answer are
         left out together. Every row is an answer of its own by default.
       answers: ties, sides and answerers of the rows. What a candidate leaves open, such as the tie threshold, is
-        inferred.
+        inferred. Flags of ties that are all False say that ties were possible; None that they were not.
       seed: of the folds and of the sampler.
       sampling_options: `num_samples` and the like, the same for all candidates.
 

@@ -1,5 +1,6 @@
 """Least-squares temporal differences (Boyan 1999), ℓ2–ℓ2 regularised (paper, step 2: estimating the Q-function)."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -15,9 +16,11 @@ Targets = Float[np.ndarray, " q"] | Float[np.ndarray, "q n"]  # of one utility, 
 SparseArray = Any  # a `scipy.sparse.csr_array`, which has no types
 Gram = Float[np.ndarray, "q q"] | SparseArray
 # From so many features on, sums that are nearly all zero are kept as sparse arrays: those of the pairs of a large table
-# of states and actions, whose dense algebra takes ten seconds a solution with 3000 pairs.
+# of states and actions, whose dense algebra takes ten seconds a solution with 3000 pairs. Where next states are few and
+# near, as on a grid, a sparse solution takes a tenth of that; where they are drawn at random, about as long.
 WIDE = 1000
-MOST_FILLED = 0.02  # share of the features that are not zero
+MOST_FILLED = 0.02  # share of the entries that are not zero
+LEAST_RIDGE = 1e-13  # in the largest number of occurrences; with less the sparse solution is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,9 @@ def transition_sums(features: ArrayLike, next_features: ArrayLike, utilities: Ar
         )
     if _wide_and_empty(features) and _wide_and_empty(next_features):
         rows, next_rows = sparse.csr_array(features), sparse.csr_array(next_features)
-        return TransitionSums((rows.T @ rows).tocsr(), (rows.T @ next_rows).tocsr(), rows.T @ utilities)
+        gram, cross = (rows.T @ rows).tocsr(), (rows.T @ next_rows).tocsr()
+        if gram.nnz + cross.nnz <= MOST_FILLED * features.shape[1] ** 2:
+            return TransitionSums(gram, cross, rows.T @ utilities)
     return TransitionSums(features.T @ features, features.T @ next_features, features.T @ utilities)
 
 
@@ -100,8 +105,10 @@ def solve_lstd(sums: TransitionSums, *, discount: float, fixed_point_ridge: floa
     known = [each.data if sparse.issparse(each) else each for each in (gram, cross, target)]
     if not all(np.all(np.isfinite(each)) for each in known):
         raise ValueError("transitions: expected finite features and utilities, got NaN or infinity")
-    if sparse.issparse(gram) and sparse.issparse(cross) and fixed_point_ridge and projection_ridge:
-        return _solve_sparse(gram, discount * cross, target, fixed_point_ridge, projection_ridge)
+    ridge = min(fixed_point_ridge, projection_ridge)
+    if sparse.issparse(gram) and sparse.issparse(cross) and ridge > LEAST_RIDGE * gram.diagonal().max():
+        with suppress(RuntimeError):  # singular, as SuperLU sees it
+            return _solve_sparse(gram, discount * cross, target, fixed_point_ridge, projection_ridge)
     gram, cross = _dense(gram), _dense(cross)
     size = len(gram)
     # Hoffman et al. (2012), ℓ2–ℓ2, with Σ = PΦᵀ: P[ΦᵀΦ′, Φᵀu]

@@ -17,9 +17,10 @@ from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.estimate import UtilityEstimate
 
 # Bounds on the transitions of the last iterations that LSTD takes: about ten for each of its features, and no more than
-# a person would wait for.
+# a person would wait for; but so many trajectories, however long: the last two of an iteration may be without noise,
+# and tell nothing of other actions.
 LEAST_TRANSITIONS, MOST_TRANSITIONS = 5_000, 10_000
-LEAST_TRAJECTORIES = 10  # however long: the last two of an iteration may be without noise, and say little of Q
+LEAST_TRAJECTORIES = 6
 
 
 @dataclass(frozen=True)

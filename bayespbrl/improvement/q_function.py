@@ -14,7 +14,8 @@ from jaxtyping import Float, Int, Key, Shaped
 
 from bayespbrl import checks
 from bayespbrl.features import StateActionFeatures
-from bayespbrl.improvement.lstd import WIDE, Targets, TransitionSums, solve_lstd, transition_sums
+from bayespbrl.improvement.lstd import Targets, TransitionSums, solve_lstd, transition_sums
+from bayespbrl.models.threads import in_threads
 from bayespbrl.policies import Policy, clipped, is_discrete, sample_actions
 from bayespbrl.policies.policy import DiscretePolicy
 from bayespbrl.trajectories import DISCOUNT, Transitions
@@ -48,8 +49,8 @@ class QFunction:
     Attributes:
       features: φ(s, a), from N states and N actions to (N, Q).
       weights: θ, of one utility or of several side by side; the last row is the bias.
-      halves: θ of the first utility from either half of the data alone, for each of m divisions into halves, one where
-        features are `WIDE`; None without quarters.
+      halves: θ of the first utility from either half of the data alone, for each of m divisions into halves; None
+        without quarters.
     """
 
     features: StateActionFeatures
@@ -119,8 +120,8 @@ def estimate_q(
     if len(sums) == 1:
         return QFunction(features, weights)
     first = [replace(part, target=part.target.reshape(part.features, -1)[:, 0]) for part in sums]
-    divisions = halvings(first)[: 1 if len(weights) >= WIDE else None]
-    halves = [solve_lstd(reduce(add, half), **vars(critic)) for half in chain.from_iterable(divisions)]
+    them = [reduce(add, half) for half in chain.from_iterable(halvings(first))]
+    halves = in_threads(lambda half: solve_lstd(half, **vars(critic)), them)
     return QFunction(features, weights, np.reshape(halves, (-1, 2, len(weights))).T)
 
 

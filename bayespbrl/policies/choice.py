@@ -13,7 +13,7 @@ from bayespbrl import checks
 from bayespbrl.policies.batch import entropies
 from bayespbrl.policies.gaussian_process import GaussianProcessPolicy
 from bayespbrl.policies.linear_gaussian import LinearGaussianPolicy
-from bayespbrl.policies.policy import ContinuousPolicy, Policy, is_discrete, is_pytree
+from bayespbrl.policies.policy import ContinuousPolicy, Policy, has_mode, is_discrete, is_pytree
 from bayespbrl.policies.softmax import SoftmaxPolicy
 from bayespbrl.policies.tabular import TabularPolicy
 
@@ -74,13 +74,17 @@ def expected_policy(given: object) -> str:
     return f"a policy (bayespbrl.policies) or a kind by name, got {given!r}"
 
 
-def fitting(policy: Policy, observation_space: Space[Any], action_space: Space[Any]) -> Policy:
+def fitting(
+    policy: Policy, observation_space: Space[Any], action_space: Space[Any], *, noise_free: bool = False
+) -> Policy:
     """`policy`, tried at one observation.
 
     Raises:
-      ValueError: one that does not take the observations of the one space, does not give the actions of the other, or
-        lacks what an update needs of it.
+      ValueError: one that does not take the observations of the one space, does not give the actions of the other,
+        lacks what an update needs of it, or is to be shown `noise_free` and does not know its most probable action.
     """
+    if noise_free and not has_mode(policy):
+        raise ValueError(f"policy: expected one with a mode because of noise_free, got a {type(policy).__name__}")
     if isinstance(observation_space, Discrete):
         observation = np.asarray(observation_space.n - 1)  # the last: a smaller table has no row for it
     else:

@@ -110,8 +110,9 @@ def rendering(environment: gymnasium.Env, limit: int) -> gymnasium.Env:
     if "rgb_array" not in modes:
         raise ValueError(f"expected a mode rgb_array, got {', '.join(modes) or 'none'}")
     own = limit if made_from(environment) is not None else None
-    if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("WAYLAND_DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's way to render without a display
+    shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if "mujoco" in sys.modules and sys.platform == "linux" and not shown:
+        os.environ.setdefault("MUJOCO_GL", "egl")  # its way to render without a display
     return flattened(gymnasium.make(spec, max_episode_steps=own, render_mode="rgb_array"))
 
 

@@ -13,7 +13,7 @@ from bayespbrl.events import Entry
 from bayespbrl.features import OwnFeatures, StateFeatures
 from bayespbrl.models import restored, stored
 from bayespbrl.runs.files import NETCDF, check_file, write_netcdf
-from bayespbrl.runs.stored_classes import NAMES, from_tree, to_tree
+from bayespbrl.runs.stored_classes import from_tree, to_tree
 from bayespbrl.trajectories import Trajectory
 from bayespbrl.utility import UtilityEstimate
 
@@ -131,13 +131,9 @@ def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
 
 def _estimate_groups(estimate: UtilityEstimate) -> dict[str, xr.DataTree]:
     """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
-    try:
-        groups = {"utility": to_tree(estimate, without=("posterior",))}
-    except ValueError:
-        if type(getattr(estimate, "features", None)) in NAMES:
-            raise
-        # φ is a function of the user's, which has to be passed again
-        groups = {"utility": to_tree(estimate, without=("posterior", "features"))}
+    own = isinstance(getattr(estimate, "features", None), OwnFeatures)
+    groups = {"utility": to_tree(estimate, without=("posterior", "features") if own else ("posterior",))}
+    if own:  # φ is a function of the user's, which has to be passed again
         groups["utility"].attrs["features"] = "other"
     if estimate.posterior is not None:
         small = stored(estimate.posterior)
