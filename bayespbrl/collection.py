@@ -51,8 +51,9 @@ class Collection:
         if not self.settings.rollouts.noise_free or not state.iteration:
             return ()
         if self.settings.questions.against_kept:
-            kept = state.best if state.restart is None else state.restart.kept
-            return (state.kept.policy, state.first_policy) if restarts else (kept.policy, state.newest.policy)
+            if restarts:
+                return state.kept.policy, state.first_policy
+            return state.to_beat.policy, state.newest.policy
         updated = state.iteration > state.started and not restarts
         return (state.newest.policy,) if updated and has_mode(state.newest.policy) else ()
 

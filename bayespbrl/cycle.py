@@ -136,11 +136,9 @@ class Cycle(Collection):
         return state.nominated and remaining <= 2 * state.left(self.settings)
 
     def _favourite(self, state: LearnerState) -> int:
-        """The iteration that followed the kept policy; of one that was replaced at a restart, the last before."""
-        if state.restart is None:
-            return state.best.number
-        kept, started = state.restart.kept.number, state.started
-        return kept if kept > started else min(kept, started - 1)
+        """The iteration that followed the policy to beat; of one that was replaced at a restart, the last before."""
+        number = state.to_beat.number
+        return number - 1 if state.restart is not None and number == state.started else number
 
     def _of_iteration(self, number: int) -> range:
         """The numbers of the trajectories of an iteration, from 0."""

@@ -81,8 +81,7 @@ def _held_out_log_probability(
     settings: np.ndarray, model: PreferenceModel, fold: np.ndarray, answers: Answers, **sampling_options: int
 ) -> tuple[np.ndarray, bool]:
     """Log probability of each answer given the other folds, shape (K,), and whether every refit converged."""
-    tied = np.zeros(len(fold), bool) if answers.indifferent is None else np.asarray(answers.indifferent)
-    outcome = np.where(tied, TIED, PREFERRED)
+    outcome = np.where(answers.tied(len(fold)), TIED, PREFERRED)
     log_probability, converged = np.zeros(len(fold)), True
     for held_out in np.unique(fold):
         asked = fold == held_out

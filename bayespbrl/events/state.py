@@ -155,6 +155,11 @@ class LearnerState:
         return 0 if self.restart is None else self.restart.iteration
 
     @property
+    def to_beat(self) -> NumberedPolicy:
+        """What the newest policy is compared with: the best before it, or what was kept when it was started anew."""
+        return self.best if self.restart is None else self.restart.kept
+
+    @property
     def query(self) -> Query | None:
         """The question that has waited longest for an answer; None if none does."""
         return self.open[0] if self.open else None

@@ -37,11 +37,6 @@ class TransitionSums:
     cross: Gram
     target: Targets
 
-    @property
-    def features(self) -> int:
-        """Q."""
-        return int(self.gram.shape[0])
-
     def __add__(self, other: "TransitionSums") -> "TransitionSums":
         return TransitionSums(self.gram + other.gram, self.cross + other.cross, self.target + other.target)
 

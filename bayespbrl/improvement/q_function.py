@@ -119,7 +119,7 @@ def estimate_q(
     weights = solve_lstd(reduce(add, sums), **vars(critic))
     if len(sums) == 1:
         return QFunction(features, weights)
-    first = [replace(part, target=part.target.reshape(part.features, -1)[:, 0]) for part in sums]
+    first = [replace(part, target=part.target.reshape(len(part.target), -1)[:, 0]) for part in sums]
     them = [reduce(add, half) for half in chain.from_iterable(halvings(first))]
     halves = in_threads(lambda half: solve_lstd(half, **vars(critic)), them)
     return QFunction(features, weights, np.reshape(halves, (-1, 2, len(weights))).T)

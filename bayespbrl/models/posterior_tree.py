@@ -91,7 +91,7 @@ def posterior_tree(
     flags = {name: (SAMPLE, chains.collected(name, length)) for name in ("candidates", "stuck", "diverging")}
     lp, settings = np.sum(log_p, axis=2), chains.collected("setting", length)
     labels = {"chain": np.arange(z.shape[0]), "draw": np.arange(length)}
-    tied = np.zeros(len(fits[0].differences), bool) if answers.indifferent is None else np.asarray(answers.indifferent)
+    tied = answers.tied(len(fits[0].differences))
     root_attributes = {
         **{
             name: x if isinstance(x, str) else float("nan" if x is None else x)

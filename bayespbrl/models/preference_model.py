@@ -116,6 +116,10 @@ class Answers:
             names,
         )
 
+    def tied(self, number: int) -> Bool[np.ndarray, " k"]:
+        """Which of `number` answers were "no difference": none where that is not known."""
+        return np.zeros(number, bool) if self.indifferent is None else np.asarray(self.indifferent)
+
     def of(self, rows: ArrayLike) -> "Answers":
         """The answers of some rows; answerers keep their numbers."""
         chosen = np.asarray(rows)
@@ -244,6 +248,6 @@ def joint_preference_model(
         steepness=steepness,
         lapse_rate=None if model.lapse_rate == 0 else lapse_rates[who],
         tie_threshold=one_of("tie_threshold", model.tie_threshold_prior) if ties else None,
-        indifferent=np.zeros(len(who), bool) if answers.indifferent is None else np.asarray(answers.indifferent),
+        indifferent=answers.tied(len(who)),
     )
     preference_model(settings[setting], likelihood, prior_scale=model.prior_scale)

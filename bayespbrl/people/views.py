@@ -75,15 +75,14 @@ def said_of(query: Query, state: LearnerState) -> tuple[View, tuple[Answer, ...]
         likelihood = state.estimate.likelihood(queries.QUERY_DRAWS)
         margins = draws[:, :1] - draws[:, 1:]
         first = float(prob(likelihood, margins).mean())
-        worth = queries.expected_information(draws[:, :1], draws[:, 1:], likelihood=likelihood)
-        said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
         thresholds = state.estimate.tie_thresholds(queries.QUERY_DRAWS)
+        worth = queries.expected_information(
+            draws[:, :1], draws[:, 1:], likelihood=likelihood, tie_thresholds=thresholds
+        )
+        said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
         if thresholds is not None:
             chances = chances_with_ties(margins, likelihood, thresholds)
-            worth = queries.expected_information(
-                draws[:, :1], draws[:, 1:], likelihood=likelihood, tie_thresholds=thresholds
-            )
-            said |= {"sure": float(chances.max()), "worth": float(worth[0] / np.log(2)), "most": np.log2(3)}
+            said |= {"sure": float(chances.max()), "most": np.log2(3)}
         if said["worth"] < LITTLE:
             said["advice"] = (
                 f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."

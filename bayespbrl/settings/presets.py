@@ -158,8 +158,8 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     if people:
         options |= PEOPLE
     shown = chosen.get("noise_free", options.get("noise_free"))
-    alone = chosen.get("clip_steps") is not None or not chosen.get("checked", True)
-    alone = alone or chosen.get("trajectories_per_iteration") == 2  # no room for what is kept
+    few = chosen.get("trajectories_per_iteration") == 2  # no room for what is kept
+    alone = few or chosen.get("clip_steps") is not None or not chosen.get("checked", True)
     if not shown or alone or chosen.get("utility") in WITHOUT_POSTERIOR:
         options.pop("against_kept", None)
     if chosen.get("utility") in WITHOUT_POSTERIOR or chosen.get("schedule", "confidence") != "confidence":

@@ -69,8 +69,7 @@ class Comparisons:
     @property
     def ordered(self) -> np.ndarray:
         """Which pairs state an order, shape (K,) bool."""
-        tied = self.answers.indifferent
-        return np.ones(len(self.pairs), bool) if tied is None else ~np.asarray(tied)
+        return ~self.answers.tied(len(self.pairs))
 
     def feature_sums(self, features: StateFeatures) -> Float[np.ndarray, "n d"]:
         """ψ(τ) of each trajectory."""
