@@ -79,7 +79,7 @@ def test_what_is_computed_ahead_is_what_is_computed_without_it_bit_for_bit(sitti
         with session.changed:  # until the thread has foreseen both likely answers
             foreseen = session.changed.wait_for(
                 lambda now=moment, n=number: (
-                    len(now.after) >= 2 and all(now.after[n, a].complete for a in now.likely[n][:2])
+                    len(now.after) >= 2 and all(now.after[n, a].complete for a in now.drawn[n].likely[:2])
                 ),
                 WAIT,
             )
@@ -118,9 +118,7 @@ def test_a_tie_is_foreseen_last_until_the_run_has_one():
         """The answers after which the next moments are foreseen."""
         order = []
         while len(order) < number and (moment := foresight.pending()) is not None:
-            entry = foresight.compute(moment)
-            if entry is not None:
-                foresight.keep(moment, entry)
+            foresight.keep(moment, foresight.compute(moment))
             if moment.complete:
                 after = foresight.present.after.items()
                 order.append(next((str(answer) for (_, answer), known in after if known is moment), "other"))
@@ -450,7 +448,8 @@ def test_an_interrupt_while_an_answer_is_kept_leaves_a_question_that_can_be_answ
     assert learner.preferences.answers == 2
 
 
-def test_an_interrupt_right_after_an_answer_is_kept_leaves_a_question_too(sitting, monkeypatch):
+@pytest.mark.parametrize("error", [KeyboardInterrupt, KeyError])
+def test_whatever_is_raised_right_after_an_answer_is_kept_leaves_a_question_too(error, sitting, monkeypatch):
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
     session, coming = sitting(learner), []
     turn = session._turn
@@ -463,8 +462,8 @@ def test_an_interrupt_right_after_an_answer_is_kept_leaves_a_question_too(sittin
     monkeypatch.setattr(session, "_turn", interrupted)
     for answer, kept in (("first", 1), ("undo", 0), ("second", 1)):
         view = session.wait(timeout=WAIT)
-        coming.append(KeyboardInterrupt())
-        with pytest.raises(KeyboardInterrupt):
+        coming.append(error())
+        with pytest.raises(error):
             session.answer(view["turn"], answer)
         assert learner.preferences.answers == kept
 

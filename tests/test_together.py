@@ -13,6 +13,7 @@ import bayespbrl
 from bayespbrl import events
 from bayespbrl.cli.commands import main
 from bayespbrl.diagnostics import people
+from bayespbrl.events import Entry
 from bayespbrl.people.foresight import Foresight
 from bayespbrl.people.seat import Stale
 from bayespbrl.people.session import Session
@@ -108,10 +109,10 @@ def by_two(budget, ends=lambda state, held: False):
     ahead = Foresight(learner.cycle, learner.state, lambda *_: (None, tuple(Answer)), NAMES, several=True)
     while not learner.finished:
         while not ahead.present.complete:
-            if (entry := ahead.compute(ahead.present)) is not None:
-                assert entry.event["event"] != "asked" or learner.preferences.answers < budget
-                learner.record(entry)
-                ahead.keep(ahead.present, entry)
+            if isinstance(piece := ahead.compute(ahead.present), Entry):
+                assert piece.event["event"] != "asked" or learner.preferences.answers < budget
+                learner.record(piece)
+            ahead.keep(ahead.present, piece)
         held = dict(ahead.present.holders)
         if learner.finished or ends(learner.state, held):
             break
@@ -150,16 +151,35 @@ def test_who_comes_while_an_update_is_computed_lets_nobody_wait_for_it_again():
             number = next(iter(moment.holders))
             learner.record(events.answered(number, Answer.FIRST, answerer="Ada"))
             ahead.move(number, Answer.FIRST, learner.state)
-        elif (entry := ahead.compute(moment)) is not None:
-            computed.append(entry.event["event"])
+            continue
+        piece = ahead.compute(moment)
+        if isinstance(piece, Entry):
+            computed.append(piece.event["event"])
             if computed[-1] != "asked":  # another comes meanwhile, and leaves
                 ahead.gather(["Ada", "Ben"])
                 ahead.gather(["Ada"])
-            current = ahead.current(moment, entry)
-            assert current is ahead.present
-            learner.record(entry)
-            ahead.keep(current, entry)
+            assert ahead.current(moment, piece) is ahead.present
+            learner.record(piece)
+        ahead.keep(ahead.current(moment, piece), piece)
     assert [event for event in computed if event != "asked"] == ["collected", "improved"] * 2
+
+
+def test_what_is_computed_changes_nothing_before_it_is_kept():
+    """Another may answer meanwhile."""
+    learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
+    ahead = Foresight(learner.cycle, learner.state, lambda *_: (None, tuple(Answer)), NAMES, several=True)
+    moment, kept = ahead.present, 0
+
+    def known():
+        return moment.state, dict(moment.holders), list(moment.entries), moment.settled, dict(moment.drawn)
+
+    while not moment.complete:
+        before = known()
+        piece = ahead.compute(moment)
+        assert all(now is was or now == was for now, was in zip(known(), before, strict=True))
+        ahead.keep(moment, piece)
+        kept += 1
+    assert (kept, moment.settled, sorted(moment.drawn)) == (6, True, [1, 2])  # an event before each, and nothing more
 
 
 def test_the_other_ones_question_cannot_be_answered(sitting):

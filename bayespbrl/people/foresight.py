@@ -6,6 +6,7 @@ computed late, bit for bit. Nothing reaches the log before the answer does.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from bayespbrl import events
 from bayespbrl.cycle import Cycle
@@ -14,6 +15,20 @@ from bayespbrl.people.views import Shown
 from bayespbrl.preferences import Answer, Query
 
 LIKELY = 2  # answers after which two answers are foreseen, each
+
+
+class Drawn(NamedTuple):
+    """What is shown of a question.
+
+    Attributes:
+      number: of the question.
+      shown: to whoever looks at it.
+      likely: the answers to it, the likeliest first.
+    """
+
+    number: int
+    shown: Shown
+    likely: tuple[Answer, ...]
 
 
 @dataclass
@@ -25,8 +40,7 @@ class Moment:
       holders: who looks at which open question, by its number.
       entries: the events since the answer.
       settled: whether everybody has a question, or there is none for those without.
-      shown: what is shown of each question, by its number; none until it is drawn.
-      likely: the answers to each, the likeliest first.
+      drawn: the questions that are drawn, by their number.
       after: what follows an answer to a question.
       failed: whether computing it raised; then it is computed again when the answer is there.
     """
@@ -35,15 +49,14 @@ class Moment:
     holders: Mapping[int, str | None] = field(default_factory=dict)
     entries: list[Entry] = field(default_factory=list)
     settled: bool = False
-    shown: dict[int, Shown] = field(default_factory=dict)
-    likely: dict[int, tuple[Answer, ...]] = field(default_factory=dict)
+    drawn: dict[int, Drawn] = field(default_factory=dict)
     after: dict[tuple[int, Answer], "Moment"] = field(default_factory=dict)
     failed: bool = False
 
     @property
     def unseen(self) -> Query | None:
         """A question due to be shown that is not drawn yet; None if all are."""
-        return next((q for q in self.state.open if q.number in self.holders and q.number not in self.shown), None)
+        return next((q for q in self.state.open if q.number in self.holders and q.number not in self.drawn), None)
 
     @property
     def complete(self) -> bool:
@@ -82,15 +95,14 @@ class Foresight:
             return None if self.present.failed else self.present
         return next((moment for moment in self._ahead() if not (moment.complete or moment.failed)), None)
 
-    def compute(self, moment: Moment) -> Entry | None:
-        """One piece of a moment: the event returned, or what is shown of a question (None). Changes nothing else."""
+    def compute(self, moment: Moment) -> Entry | Drawn | None:
+        """One piece of a moment: an event, what is shown of a question, or that nothing follows (None).
+
+        Changes nothing: answers may come meanwhile.
+        """
         if (query := moment.unseen) is not None:
-            moment.shown[query.number], moment.likely[query.number] = self.show(moment.state, query)
-            return None
-        entry = self._next(moment)
-        if entry is None:
-            moment.settled = True
-        return entry
+            return Drawn(query.number, *self.show(moment.state, query))
+        return self._next(moment)
 
     def _next(self, moment: Moment) -> Entry | None:
         if not self.several and moment.state.open and not moment.holders:  # repeats that wait for somebody else
@@ -105,22 +117,27 @@ class Foresight:
             return None
         return self.cycle.next(moment.state, free[0], others=held)
 
-    def keep(self, moment: Moment, entry: Entry) -> None:
-        """Add an event that `compute` returned."""
-        moment.state = events.apply(moment.state, entry)
-        moment.holders = self._holders(moment.state, moment.holders)
-        moment.entries.append(entry)
+    def keep(self, moment: Moment, piece: Entry | Drawn | None) -> None:
+        """Add what `compute` returned."""
+        if piece is None:
+            moment.settled = True
+        elif isinstance(piece, Drawn):
+            moment.drawn[piece.number] = piece
+        else:
+            moment.state = events.apply(moment.state, piece)
+            moment.holders = self._holders(moment.state, moment.holders)
+            moment.entries.append(piece)
 
-    def current(self, moment: Moment, entry: Entry | None) -> Moment:
-        """The moment that an event is of which was computed for `moment`.
+    def current(self, moment: Moment, piece: Entry | Drawn | None) -> Moment:
+        """The moment that a piece is of which was computed for `moment`.
 
         It is the present one where no more has changed meanwhile than who is here, and the event is the same for all:
         nobody waits again because another came or left.
         """
-        if entry is None or moment.state is not self.present.state:
+        if not isinstance(piece, Entry) or moment.state is not self.present.state:
             return moment
         last = moment.state.in_last_iteration(self.cycle.settings)  # it ends when all have answered
-        same = entry.event["event"] == "collected" or (entry.event["event"] == "improved" and not last)
+        same = piece.event["event"] == "collected" or (piece.event["event"] == "improved" and not last)
         return self.present if same else moment
 
     def again(self, state: LearnerState) -> None:
@@ -156,8 +173,7 @@ class Foresight:
     def _following(self, moment: Moment, state: LearnerState, holders: Mapping[int, str | None]) -> Moment:
         """A moment with that state, and with what is known of the questions of `moment` that are still open."""
         still = self._holders(state, holders)
-        shown = {number: moment.shown[number] for number in still if number in moment.shown}
-        return Moment(state, still, shown=shown, likely={number: moment.likely[number] for number in shown})
+        return Moment(state, still, drawn={number: moment.drawn[number] for number in still if number in moment.drawn})
 
     def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
         """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.
@@ -200,8 +216,8 @@ class Foresight:
     def _after(self, moment: Moment, most: int) -> Iterator[Moment]:
         if not moment.complete:
             return
-        answers = ((n, who, answer) for n, who in moment.holders.items() for answer in moment.likely[n][:most])
-        for number, who, answer in sorted(answers, key=lambda each: moment.likely[each[0]].index(each[2])):
+        answers = ((n, who, answer) for n, who in moment.holders.items() for answer in moment.drawn[n].likely[:most])
+        for number, who, answer in sorted(answers, key=lambda each: moment.drawn[each[0]].likely.index(each[2])):
             if (number, answer) not in moment.after:
                 state = events.apply(moment.state, events.answered(number, answer, answerer=who))
                 moment.after[number, answer] = self._following(moment, state, moment.holders)

@@ -20,7 +20,7 @@ from bayespbrl.events import Entry, LearnerState
 from bayespbrl.learner import Learner
 from bayespbrl.people import views
 from bayespbrl.people.clips import Clips
-from bayespbrl.people.foresight import Foresight, Moment
+from bayespbrl.people.foresight import Drawn, Foresight, Moment
 from bayespbrl.people.practice import Introduction
 from bayespbrl.people.seat import Seat, Stale
 from bayespbrl.people.views import (
@@ -162,6 +162,7 @@ class Session:
                 raise Stale(f"turn: expected {seat.turn}, got {turn}")
             if (phase := seat.view["phase"]) not in (INSTRUCTIONS, QUESTION):
                 raise Stale(f"turn {turn}: expected a question that waits, got none ({phase})")
+            known = self.learner.state
             try:
                 if (introduction := self._introducing(seat)) is not None:
                     introduction.answer(answer)
@@ -171,9 +172,10 @@ class Session:
                 else:
                     self._take(seat, answer, seconds, replays)
                 self._settle()
-            except (KeyboardInterrupt, SystemExit):  # of a notebook's kernel; what is kept by now holds
-                self._foresight.again(self.learner.state)
-                self._settle()
+            except BaseException as error:
+                if self.learner.state is not known or not isinstance(error, Exception):  # what is kept holds
+                    self._foresight.again(self.learner.state)
+                    self._settle()
                 raise
 
     def _turn(self, seat: Seat) -> None:
@@ -216,8 +218,7 @@ class Session:
     def _think(self) -> None:
         while True:
             with self.changed:
-                pause = GATHER if self._several else None
-                self.changed.wait_for(lambda: self._closing or self._pending() is not None, pause)
+                self.changed.wait_for(lambda: self._closing or self._pending(), GATHER if self._several else None)
                 self.gather()
                 moment = self._pending()
             if self._closing:
@@ -225,11 +226,11 @@ class Session:
             if moment is None:
                 continue
             try:
-                entry = self._foresight.compute(moment)
+                piece = self._foresight.compute(moment)
                 with self.changed:
                     # computed again in the same way, unless the environment goes by its earlier episodes
                     if not self._closing or self.learner.comparable_starts is False:
-                        self._keep(moment, entry)
+                        self._keep(moment, piece)
             except Exception as error:  # the environment's, or a full disk
                 with self.changed:
                     self._failed(moment, error)
@@ -240,12 +241,11 @@ class Session:
         alone = known and self.learner.comparable_starts is False
         return None if self.over or alone else self._foresight.pending()
 
-    def _keep(self, moment: Moment, entry: Entry | None) -> None:
-        moment = self._foresight.current(moment, entry)
-        if entry is not None:
-            if moment is self._foresight.present:
-                self.learner.record(entry)
-            self._foresight.keep(moment, entry)
+    def _keep(self, moment: Moment, piece: Entry | Drawn | None) -> None:
+        moment = self._foresight.current(moment, piece)
+        if isinstance(piece, Entry) and moment is self._foresight.present:
+            self.learner.record(piece)
+        self._foresight.keep(moment, piece)
         if moment is self._foresight.present:
             self._settle()
         self.changed.notify_all()
@@ -309,12 +309,12 @@ class Session:
             seat.set(self._described(seat, FINISHED, state) | {"say": views.ending(self.learner, state, given)})
         elif (introduction := self._introducing(seat)) is not None:
             self._introduce(seat, introduction)
-        elif number in moment.shown and (moment.complete or self._several):
+        elif number in moment.drawn and (moment.complete or self._several):
             seat.number = number
             mine = [past for past in state.past[self._past :] if past.answerer == seat.answerer]
             given = sum(past.answer is not Answer.SKIP for past in mine)
             notice = views.notice(given, practised=seat.introduction is not None)
-            self._ask(seat, self._described(seat, QUESTION, state) | {"notice": notice}, moment.shown[number])
+            self._ask(seat, self._described(seat, QUESTION, state) | {"notice": notice}, moment.drawn[number].shown)
         elif moment.complete and self._several:
             seat.set(self._described(seat, WAITING, state) | {"say": views.NOTHING_LEFT})
         else:
