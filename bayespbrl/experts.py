@@ -4,9 +4,10 @@ An expert is any callable of two trajectories, in the order shown, that returns 
 must depend on the two trajectories only: a resumed run may ask a question again.
 """
 
+import time
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import Path
 from typing import Protocol
@@ -216,7 +217,7 @@ PROMPT = "Which is better? [1] first  [2] second  [t] tie  [s] cannot tell  [u] 
 KEYS = {"1": Answer.FIRST, "2": Answer.SECOND, "t": Answer.TIE, "s": Answer.SKIP, "u": Answer.UNDO}
 
 
-@dataclass(frozen=True)
+@dataclass
 class TerminalExpert:
     """A person at a terminal, who looks at a picture of the two trajectories on disk.
 
@@ -224,11 +225,13 @@ class TerminalExpert:
       draw: writes a picture of the two trajectories, in the order shown, to a path.
       folder: of the picture `query.png`, which is overwritten for each question.
       read: prompts for a line of text.
+      seconds: from the first prompt to the last answer: to draw the picture takes a while too. None before.
     """
 
     draw: Callable[[Trajectory, Trajectory, Path], None]
     folder: Path
     read: Callable[[str], str] = input
+    seconds: float | None = field(default=None, init=False)
 
     def __call__(self, first: Trajectory, second: Trajectory) -> Answer:
         """The person's answer; raises `KeyboardInterrupt` where they stop or the input ends."""
@@ -236,6 +239,12 @@ class TerminalExpert:
         picture = self.folder / "query.png"
         self.draw(first, second, picture)
         print(f"The two trajectories are in {picture}")
+        began = time.perf_counter()
+        answer = self._asked()
+        self.seconds = time.perf_counter() - began
+        return answer
+
+    def _asked(self) -> Answer:
         while True:
             try:
                 reply = self.read(PROMPT).strip().lower()

@@ -16,6 +16,7 @@ from bayespbrl.experts import Expert
 from bayespbrl.features import FeatureSource, StateFeatures
 from bayespbrl.improvement import schedules
 from bayespbrl.policies import Policy, Sampler, greedy, has_mode
+from bayespbrl.policies.actor import Actor
 from bayespbrl.policies.choice import expected_policy, fitting, initial_policy
 from bayespbrl.preferences import Answer, Preferences, Query, parse_answer
 from bayespbrl.queries import QUERY_RULES, QueryRule
@@ -100,7 +101,10 @@ class Learner:
         self.log: Log | None = None
         noise_free = kept is None and self.settings.rollouts.noise_free
         self.own_policy = None if own_policy is None else fitting(own_policy, *spaces, noise_free=noise_free)
-        self.state = events.replay(LearnerState.begun(self.first_policy()), entries)
+        first, rollouts = self.own_policy, self.settings.rollouts
+        if first is None:  # a random one
+            first = initial_policy(rollouts.policy, *spaces, action_scale=rollouts.initial_action_scale, period=period)
+        self.state = events.replay(LearnerState.begun(first), entries)
 
     def logged(self, log: Log) -> "Learner":
         """The same learner, with each further event appended to `log`."""
@@ -118,6 +122,7 @@ class Learner:
     def policy(self) -> Sampler:
         """The best policy by the posterior, without its noise; the newest, with it, where updates are not checked.
 
+        It takes and gives plain rows of numbers, as all policies do; `actor` acts in the environment.
         One that was started anew replaces the policy before it only where it is clearly better.
         """
         tried, kept = self.state.newest.tried or self.state.restart is not None, self.state.kept.policy
@@ -128,18 +133,10 @@ class Learner:
         """The newest policy, which the next trajectories follow."""
         return self.state.newest.policy
 
-    def first_policy(self) -> Policy:
-        """The policy of the first trajectories: the user's own, or a random one."""
-        if self.own_policy is not None:
-            return self.own_policy
-        options, environment = self.settings.rollouts, self.environment
-        return initial_policy(
-            options.policy,
-            environment.observation_space,
-            environment.action_space,
-            action_scale=options.initial_action_scale,
-            period=opening.environment_attribute(environment, "observation_period"),
-        )
+    def actor(self, policy: Sampler | None = None) -> Actor:
+        """`policy`, or None: `self.policy`, in the environment as it was given: `learner.actor().act(observation)`."""
+        chosen, given = self.policy if policy is None else policy, self.given
+        return Actor(chosen, given.observation_space, given.action_space, np.random.default_rng())
 
     @property
     def worth_asking(self) -> float | None:
@@ -272,8 +269,8 @@ class Learner:
         Args:
           expert: called with the two trajectories in the order shown. Where it returns an undo, the last answer is
             taken back if it is the same person's.
-          answerer: the name of a person who answers; how long each answer took is then kept too. A repeated question
-            that waits for another person is left open.
+          answerer: the name of a person who answers; how long each answer took is then kept too, `expert.seconds` where
+            there is such an attribute. A repeated question that waits for another person is left open.
           progress: called after each iteration, those that ask nothing among them.
         """
         checks.function("expert", expert, " of two trajectories")
@@ -284,7 +281,8 @@ class Learner:
         while (query := self._question_for(answerer, progress)) is not None:
             began = time.perf_counter()
             answer = parse_answer(expert(*query.trajectories))
-            seconds = None if answerer is None else time.perf_counter() - began
+            took = getattr(expert, "seconds", time.perf_counter() - began)
+            seconds = None if answerer is None else took
             vain = vain + 1 if answer is Answer.UNDO and not self.state.may_undo(answerer) else 0
             if vain == VAIN_UNDOS:
                 raise ValueError(f"expert: expected an answer, because there is none to take back, got {vain} undos")

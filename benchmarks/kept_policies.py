@@ -58,7 +58,7 @@ def evaluated(study: Path, episodes: int, seed: int) -> Row:
         "best": best,
         "value kept": value(policies[kept], COMPARISON),
         "value best": value(policies[best], COMPARISON),
-        "value first": value(learner.first_policy(), COMPARISON),
+        "value first": value(learner.state.first_policy, COMPARISON),
         "seemed best": max(seemed.values()),
         "seemed kept": seemed[kept],
     }

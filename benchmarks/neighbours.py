@@ -255,8 +255,8 @@ def done(file: Path) -> list[dict[str, Any]]:
     """The rows so far; a last one that is cut off is dropped."""
     if not file.exists():
         return []
-    with file.open() as lines:
-        rows = [row for row in csv.DictReader(lines) if all(row.get(name) not in (None, "") for name in COLUMNS)]
+    whole = [line for line in file.read_text().splitlines(keepends=True) if line.endswith("\n")]
+    rows = [row for row in csv.DictReader(whole) if all(row.get(name) not in (None, "") for name in COLUMNS)]
     return [{name: kind(row[name]) for name, kind in COLUMNS.items()} for row in rows]
 
 

@@ -17,11 +17,11 @@ def done(file: Path, columns: Sequence[str]) -> list[Row]:
     """The rows so far; a last one that is cut off is dropped."""
     if not file.exists():
         return []
-    with file.open() as lines:
-        table = csv.DictReader(lines)
-        if absent := [name for name in columns if name not in (table.fieldnames or ())]:
-            raise SystemExit(f"{file}: expected a column {absent[0]}, got none; choose another --out")
-        rows = [row for row in table if all(row[name] not in (None, "") for name in columns)]
+    # half of a number is a number too
+    table = csv.DictReader([line for line in file.read_text().splitlines(keepends=True) if line.endswith("\n")])
+    if absent := [name for name in columns if name not in (table.fieldnames or ())]:
+        raise SystemExit(f"{file}: expected a column {absent[0]}, got none; choose another --out")
+    rows = [row for row in table if all(row[name] not in (None, "") for name in columns)]
     return [{name: float(row[name]) for name in columns} for row in rows]
 
 

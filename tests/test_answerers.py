@@ -564,6 +564,11 @@ def test_a_bad_cell_of_a_question_is_named(tmp_path, row, message):
         read_questions(tmp_path / "answers.csv")
 
 
+def test_a_line_without_a_number_has_the_next(tmp_path):
+    (tmp_path / "answers.csv").write_text("question,first,second,answer\n2,0,1,first\n,1,2,tie\n7,2,3,tie\n,3,4,tie\n")
+    assert [past.number for past in read_questions(tmp_path / "answers.csv")] == [2, 3, 7, 8]
+
+
 def test_a_column_in_capitals_is_not_left_out_without_a_word(tmp_path):
     (tmp_path / "answers.csv").write_text("first,second,answer,Answerer,Age\n0,1,first,Ada,30\n")
     with pytest.raises(ValueError, match=r"answers\.csv: expected the column answerer in small letters, got Answerer"):

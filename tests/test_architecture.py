@@ -50,7 +50,7 @@ BELOW = {
     "numerics": [],
     "environments": ["numerics"],
     "models": ["numerics"],
-    "policies": ["numerics"],
+    "policies": ["numerics", "environments"],
     "what flows round": ["numerics"],
     "estimate": ["numerics", "models", "what flows round"],
     **dict.fromkeys(STEPS, FLOWS),

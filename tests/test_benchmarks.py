@@ -241,7 +241,7 @@ def test_rows_by_seed_go_on_where_they_were_cut(tmp_path):
 
     (first,) = rows_by_seed.run([5], file, columns, square)
     with file.open("a") as rows:
-        rows.write("6,")  # killed while it wrote
+        rows.write("6,3")  # killed while it wrote 36
     assert rows_by_seed.done(file, columns) == [first]
     rows = rows_by_seed.run([5, 6], file, columns, square)
     assert rows == [{"seed": 5, "square": 25}, {"seed": 6, "square": 36}] == rows_by_seed.done(file, columns)

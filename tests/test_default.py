@@ -19,8 +19,8 @@ from bayespbrl.envs import opening
 from bayespbrl.events import answered
 from bayespbrl.improvement.check import CLEARLY, Check, share_better
 from bayespbrl.policies import greedy
+from bayespbrl.policies.actor import Actor
 from bayespbrl.rollouts import rollout
-from bayespbrl.runs.actor import Actor
 from bayespbrl.runs.files import write_netcdf
 
 FAST = {"max_steps": 8, "evaluation_episodes": 4, "centres": 20, "seed": 3, "hyperparameters": "given"}
@@ -148,7 +148,7 @@ def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
         {**summary, "seconds": mine["seconds"]}
         for summary, mine in zip(run.iterations, restarted.iterations[:began], strict=False)
     ]
-    first = restarted.learner.first_policy()
+    first = restarted.learner.state.first_policy
     drawn = rollouts.rollout(
         restarted.learner.environment,
         first,
@@ -239,7 +239,7 @@ def test_policies_are_compared_without_noise_and_a_restarted_one_before_it_is_ke
         if query[0].duel:
             assert run.preferences.undominated == undominated
             assert {number - 1, number - 2} == set(run.preferences.pairs[-1])
-    policies = [run.first_policy(), *(e.parts["policy"] for e in log.entries if e.event["event"] == "improved")]
+    policies = [run.state.first_policy, *(e.parts["policy"] for e in log.entries if e.event["event"] == "improved")]
     for newest, kept in duels:
         last_two = run.trajectories[10 * newest + 8 : 10 * newest + 10]
         np.testing.assert_array_equal(last_two[0].states[0], last_two[1].states[0])

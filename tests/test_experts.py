@@ -1,8 +1,11 @@
 """Experts: the noise-free return, a share of wrong answers, a person at the prompt."""
 
+from types import SimpleNamespace
+
 import gymnasium
 import numpy as np
 import pytest
+from toys import QUICK, Memory
 
 import bayespbrl
 from bayespbrl.experts import (
@@ -126,6 +129,24 @@ def test_a_person_answers_by_key_or_by_word(tmp_path, capsys, reply, answer):
     picture = tmp_path / "pictures" / "query.png"
     assert picture.read_text() == "2 and 1 steps"  # in the order shown
     assert str(picture) in capsys.readouterr().out
+
+
+def test_how_long_a_person_took_is_without_the_drawing(tmp_path, monkeypatch):
+    now = [0.0]
+
+    def draw(first, second, path):
+        now[0] += 60
+
+    def read(prompt):
+        now[0] += 2.5
+        return "1"
+
+    monkeypatch.setattr("bayespbrl.experts.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    expert, log = TerminalExpert(draw, tmp_path, read), Memory()
+    assert expert.seconds is None
+    options = QUICK | {"iterations": 1, "expert": "terminal"}
+    bayespbrl.Learner("gridworld", **options).logged(log).run(expert, answerer="Ada")
+    assert {event["seconds"] for event in log.answers()} == {2.5}
 
 
 def test_a_person_who_types_nonsense_is_asked_again(tmp_path, capsys):

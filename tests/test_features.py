@@ -14,6 +14,7 @@ from bayespbrl.features import (
     FeatureSource,
     JointRadialBasis,
     OneHot,
+    OwnFeatures,
     RadialBasis,
     RadialBasisOptions,
     StateActionProduct,
@@ -492,3 +493,20 @@ def test_masked_entries_and_rows_of_different_lengths_are_named(features, messag
 def test_each_state_has_an_action_of_those_there_are(actions):
     with pytest.raises(ValueError, match=r"^actions: expected"):
         StateActionProduct(OneHot(2), 3)(np.array([0, 1]), actions)
+
+
+def test_features_of_the_users_own_are_divided_by_their_ranges():
+    def features(states):
+        return np.column_stack([states[:, 0], 5 + 2 * states[:, 0], np.full(len(states), -3.0), 0 * states[:, 0]])
+
+    states = np.array([[-1.0], [0.0], [3.0]])
+    own = OwnFeatures.in_any_units(features, states)
+    assert own.units == (4, 8, 3, 1)
+    np.testing.assert_array_equal(own(states), features(states) / [4, 8, 3, 1])
+    np.testing.assert_array_equal(OwnFeatures(features)(states), features(states))
+    corners = np.eye(5)[[0, 1, 4, 0, 0]]
+    np.testing.assert_array_equal(OwnFeatures.in_any_units(lambda s: corners[s], np.arange(5))(np.arange(5)), corners)
+    with pytest.raises(ValueError, match="features: expected 4 for each state, as before, got 1"):
+        OwnFeatures(lambda s: s, own.units)(states)
+    with pytest.raises(ValueError, match="features: ranges: expected finite entries"):
+        OwnFeatures.in_any_units(lambda s: s, np.array([[-1.7e308], [1.7e308]]))

@@ -566,6 +566,44 @@ def test_features_of_the_users_own_are_used():
     assert run.estimate.weights.shape == (2,)
 
 
+def test_features_of_the_users_own_learn_the_same_in_any_units():
+    def learned(unit):
+        def features(states):
+            return np.column_stack([states[:, 0], states[:, 0] ** 2, unit * states[:, 1], np.full(len(states), unit)])
+
+        options = QUICK | {"utility": "posterior-mean", "hyperparameters": "inferred"}
+        return Learner(Slope(), features=features, **options).run(ReturnExpert())
+
+    run, other = learned(1.0), learned(1024.0)  # a power of two: rounding is the same
+    assert fingerprint(run) == fingerprint(other)
+    assert [each["value"] for each in run.iterations] == [each["value"] for each in other.iterations]
+    np.testing.assert_array_equal(run.estimate.weights, other.estimate.weights)
+    assert np.ptp(run.estimate.features(run.trajectories[0].states)[:, 0]) <= 1
+
+
+def test_a_learner_acts_in_the_environment_as_it_was_given():
+    class Shifted(gymnasium.Env):
+        """Counts from 3, with actions from -1."""
+
+        observation_space, action_space = Discrete(4, start=3), Discrete(3, start=-1)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.state = 3
+            return self.state, {}
+
+        def step(self, action):
+            assert action in (-1, 0, 1)
+            self.state = int(np.clip(self.state + action, 3, 6))
+            return self.state, float(self.state), False, False, {}
+
+    learned = Learner(Shifted(), **QUICK).run(ReturnExpert())
+    assert {learned.actor().act(state) for state in (3, 4, 5, 6) for _ in range(20)} <= {-1, 0, 1}
+    assert {learned.actor(learned.state.first_policy).act(3) for _ in range(50)} == {-1, 0, 1}
+    with pytest.raises(ValueError, match="observation"):
+        learned.actor().act(9)
+
+
 def test_features_of_the_users_own_that_are_not_finite_are_refused_and_the_answers_kept():
     run, log = remembered(features=lambda states: np.full((len(states), 2), np.nan))
     with pytest.raises(ValueError, match="features <lambda>: expected finite numbers"):

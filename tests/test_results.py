@@ -426,6 +426,48 @@ def test_text_in_place_of_numbers_and_no_finished_trial_are_named(made):
         read_study(made)
 
 
+def told_of(made, file, change):
+    """What is said of a study after one change to the lines of a file."""
+    lines = (made / file).read_text().splitlines()
+    change(lines)
+    (made / file).write_text("\n".join(lines) + "\n")
+    with pytest.raises(ValueError) as refusal:  # noqa: PT011
+        read_study(made)
+    assert str(made / file) in str(refusal.value)
+    return str(refusal.value)
+
+
+def test_a_damaged_line_is_no_answer(made):
+    """One bad cell makes texts of a column of true and false, and each text is true."""
+    columns = ["tasks", "methods", "noise", "variants", "seed", "question", "iteration", "predicted", "first"]
+    kept = f"{','.join(columns)}\nt,first,,,2,3,2,0.4,True\nt,first,,,2,4,3,,False\n"
+    (made / "answers.csv").write_text(kept)
+    read_study(made)
+
+    def with_cell(place, text):
+        def change(lines):
+            cells = lines[1].split(",")
+            lines[1] = ",".join([*cells[:place], text, *cells[place + 1 :]])
+
+        return change
+
+    for column, text, told in (
+        ("first", "1.7", "expected True or False as first"),
+        ("first", "", "expected True or False as first"),
+        ("predicted", "1.7", "expected probabilities as predicted, got 1.7"),
+        ("seed", "", "expected a number as seed in each line, got none in 1 line"),
+    ):
+        assert told in told_of(made, "answers.csv", with_cell(columns.index(column), text))
+        (made / "answers.csv").write_text(kept)
+    assert "expected one line for each question, got two" in told_of(
+        made, "answers.csv", lambda lines: lines.append(lines[1])
+    )
+    (made / "answers.csv").write_text(kept)
+    assert "expected one line for each iteration, got two" in told_of(
+        made, "iterations.csv", lambda lines: lines.append(lines[1])
+    )
+
+
 RUN = """
 trials = 1
 seed = 2970

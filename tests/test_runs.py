@@ -994,7 +994,7 @@ class Nested(LinearGaussianPolicy):
 
 
 def test_a_policy_of_parts_is_known_by_all_their_classes():
-    first = bayespbrl.Learner("Pendulum-v1", policy="linear-gaussian", **QUICK).first_policy()
+    first = bayespbrl.Learner("Pendulum-v1", policy="linear-gaussian", **QUICK).state.first_policy
     fields = {field.name: getattr(first, field.name) for field in dataclasses.fields(LinearGaussianPolicy)}
     policy = Nested(**fields)
     assert classes_of(policy) == (Nested, Net)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pandas as pd
 import pytest
 from distributed.client import ClosedClientError
@@ -320,6 +321,7 @@ BAD = [
     ("[tasks.gridworld]\n[noise]\nfew = 3", "noise.few: expected a table, got 3"),
     ("[tasks.gridworld]\n[[leave_out]]\ntasks = ['nowhere']", "leave_out: expected a list of tasks among gridworld"),
     ("[tasks.gridworld]\n[[leave_out]]\ntasks = ['gridworld']", "all are left out"),
+    ("[tasks.gridworld]\n[[leave_out]]\nmethods = ['mean']", "leave_out: expected no methods: none declared, got"),
     ("leave_out = 5\n[tasks.gridworld]", "leave_out: expected a list of tables, got 5"),
     ("[tasks.gridworld]\n[[leave_out]]\ntasks = [['a']]", "leave_out: expected a list of tasks among gridworld"),
     ("[tasks.'../up']", "expected a name of letters"),
@@ -482,6 +484,8 @@ def test_a_process_that_dies_fails_its_own_call_and_no_other(tmp_path):
         assert executor.submit(killed_once, tmp_path).result() != os.getpid()
         with pytest.raises(RuntimeError, match="ZeroDivisionError: by nothing"):
             executor.submit(fails, "by nothing").result()
+        with pytest.raises(MemoryError, match="Unable to allocate"):  # NumPy's own kind: the trial is started again
+            executor.submit(np.empty, 1 << 60).result()
 
 
 def test_no_scheduler_is_one_line(monkeypatch, capsys, tmp_path):

@@ -503,3 +503,25 @@ def test_twenty_answers_find_the_one_of_eight_dimensions_that_matters():
     estimate = estimate_utility(paths, pairs, features, method="posterior-mean", discount=1.0)
     unseen = paths[40:]
     assert np.corrcoef(estimate.trajectory_utilities(unseen), returns[40:])[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("method", ["posterior-mean", "linear-program"])
+def test_scaled_columns_are_understood_in_any_units(method):
+    rng = np.random.default_rng(0)
+    sums = rng.normal(size=(30, 3))
+    returns = sums.sum(axis=1)
+    pairs = [(i, j) if returns[i] > returns[j] else (j, i) for i, j in rng.choice(30, (12, 2)).tolist() if i != j]
+    plain, scaled = (
+        infer_utility(sums * units, pairs, scaled=True, method=method) for units in (np.ones(3), [1, 4096, 2**-12])
+    )
+    np.testing.assert_array_equal(plain.weights, scaled.weights)
+    np.testing.assert_array_equal(plain.utilities(sums), scaled.utilities(sums * [1, 4096, 2**-12]))
+    assert np.corrcoef(plain.utilities(sums), returns)[0, 1] > 0.9
+    raw = infer_utility(sums * [1, 4096, 2**-12], pairs, method=method)
+    assert np.corrcoef(raw.utilities(sums * [1, 4096, 2**-12]), returns)[0, 1] < 0.8
+
+
+def test_scaled_columns_without_rows_or_answers():
+    assert infer_utility(np.zeros((0, 2)), [], scaled=True).weights.tolist() == [[0, 0]]
+    with pytest.raises(ValueError, match="scaled: expected true or false, got 1"):
+        infer_utility(np.eye(2), [(0, 1)], scaled=1)

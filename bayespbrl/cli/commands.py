@@ -102,7 +102,8 @@ RUN_OPTIONS = {
     "--hyperparameters given.",
     "discount": "Discount of Q, in [0, 1); by default by the horizon, within 0.98 and 0.995; the paper's is 0.98.",
     "trajectory_discount": "Discount of the trajectory features, in [0, 1]: 1 by default, because experts judge whole "
-    "trajectories. The paper's is the discount of Q, which gridworld, bicycle and acrobot have by default too.",
+    "trajectories. The paper's is the discount of Q, which gridworld, bicycle and acrobot have by default too, and "
+    "with --preset paper all tasks but swing-up, Pendulum-v1 and CartPole-v1.",
     "wrong_answers": "Share of the simulated expert's answers that are reversed, in [0, 1].",
     "policy": f"Kind of policy: auto, {', '.join(POLICIES)}.",
     "centres": "Number of radial basis functions of each kind of feature.",

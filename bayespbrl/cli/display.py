@@ -124,7 +124,7 @@ def check_expert(name: str | None, answerers: Sequence[str]) -> None:
         )
     if name == "other":
         raise ValueError(
-            "expert: expected a simulated expert, page or terminal, got other; continue in Python with Learner.run"
+            "expert: expected a simulated expert, page or terminal, got other; continue in Python or by bayespbrl ask"
         )
     if name == "page":
         check_page_installed()

@@ -2,7 +2,7 @@
 
 Features are callables on NumPy arrays, drawn anew at each iteration from the observed samples. Each is a frozen
 dataclass of arrays and numbers, so that a run can store what it used. A user's own state features are any function of
-observations; `OwnFeatures` checks what it returns.
+observations, in any units; `OwnFeatures` checks and scales what it returns.
 
 functions   what features are: functions of arrays, checked
 discrete    of discrete states
@@ -12,7 +12,14 @@ drawn       those of an environment, drawn at what was observed
 
 from bayespbrl.features.discrete import DiffusionBasis, OneHot, diffusion_basis
 from bayespbrl.features.drawn import FeatureSource, StateActionProduct, draw_state_action_features, draw_state_features
-from bayespbrl.features.functions import OwnFeatures, StateActionFeatures, StateFeatures, checked_features, linear
+from bayespbrl.features.functions import (
+    OwnFeatures,
+    StateActionFeatures,
+    StateFeatures,
+    checked_features,
+    linear,
+    ranges,
+)
 from bayespbrl.features.radial import JointRadialBasis, RadialBasis, RadialBasisOptions
 
 __all__ = [
@@ -31,4 +38,5 @@ __all__ = [
     "draw_state_action_features",
     "draw_state_features",
     "linear",
+    "ranges",
 ]

@@ -111,12 +111,13 @@ class FeatureSource:
     def of_states(
         self, trajectories: Sequence[Trajectory], options: RadialBasisOptions, *, rng: np.random.Generator
     ) -> StateFeatures:
-        """φ(s), the user's or drawn at all states of the trajectories.
+        """φ(s), the user's in the units of the states of the trajectories, or drawn at these.
 
         Where all are equally long and none ended by itself, there is no constant feature.
         """
         if self.own is not None:
-            return OwnFeatures(self.own)
+            observed = np.concatenate([trajectory.states for trajectory in trajectories])
+            return OwnFeatures.in_any_units(self.own, np.unique(observed) if observed.ndim == 1 else observed)
         space = self.observation_space
         if options.diffusion and isinstance(space, Discrete):
             if space.n > MOST_CONNECTED:

@@ -2,7 +2,7 @@
 //
 // `model` is anywidget's: get(name), send(message), on(event, callback), off(event, callback).
 //   view           what to show: {phase, turn, task, answered, budget, iteration, clips, rate, worth, sure, advice, undo, say,
-//                  answerer, practice: [number, of], notice}
+//                  answerer, practice: [number, of], notice, most (bits an answer may be worth), all_given}
 //   first, second  the sprite sheets of the two clips, bytes
 //   whole_page     whether keys count wherever the focus is
 // It sends {turn, answer, seconds, replays} and hears, as "msg:custom", {refused: turn, say} and {connection: "lost" | "back"}.

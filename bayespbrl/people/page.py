@@ -167,7 +167,7 @@ class Page:
             message, key = answer_of(json.loads(body)), request.headers.get("idempotency-key")
             await asyncio.to_thread(self._take, seat_of(request), key, *message)
         except Stale as error:
-            return PlainTextResponse(str(error), 409)
+            return PlainTextResponse(checks.one_line(error)[:300], 409)
         except (ValueError, RecursionError) as error:
             return PlainTextResponse(checks.one_line(error)[:300], 400)
         return Response(status_code=204)

@@ -5,6 +5,7 @@ tabular, softmax, linear_gaussian, gaussian_process
 sparse_regression        the weighted FITC regression of the Gaussian process
 hyperparameter_search    its bandwidths and variances by CMA-ES
 greedy                   a policy without its noise
+actor                    a policy to act with in an environment, as stable-baselines3 has them
 batch                    a policy at many observations; samples checks what it is fitted to
 spaces                   which spaces suit it, and actions within their bounds
 """

@@ -178,10 +178,28 @@ def _read(file: Path, columns: list[str]) -> pd.DataFrame:
         raise ValueError(f"{file}: expected a table, got {checks.reason(error)}") from error
     if absent := [name for name in columns if name not in table]:
         raise ValueError(f"{file}: expected the columns {', '.join(columns)}, got none of {', '.join(absent)}")
-    for name in ("seed", "iteration", "answers", "value", "predicted"):
-        if len(table) and name in table and not pd.api.types.is_numeric_dtype(table[name]):
-            raise ValueError(f"{file}: expected numbers as {name}, got {table[name].dtype}")
+    if len(table):
+        _check(file, table)
     return table
+
+
+def _check(file: Path, table: pd.DataFrame) -> None:
+    """Check the figures of a table by their kind; `ValueError` where a line was damaged."""
+    for name in ("seed", "question", "iteration", "answers", "value", "predicted"):
+        if name in table and not pd.api.types.is_numeric_dtype(table[name]):
+            raise ValueError(f"{file}: expected numbers as {name}, got {table[name].dtype}")
+    key = [*AXES, "seed", "question" if "question" in table else "iteration"]
+    for name in key:
+        if (gaps := int(table[name].isna().sum())) and name not in AXES:
+            raise ValueError(f"{file}: expected a number as {name} in each line, got none in {gaps} lines")
+    if (again := table.duplicated(key)).any():
+        line = table[again].iloc[0]
+        told = ", ".join(f"{name} {line[name]}" for name in key if line[name] != "")
+        raise ValueError(f"{file}: expected one line for each {key[-1]}, got two for {told}")
+    if "first" in table and table["first"].dtype != bool:
+        raise ValueError(f"{file}: expected True or False as first in each line, got others")
+    if "predicted" in table and not table["predicted"].dropna().between(0, 1).all():
+        raise ValueError(f"{file}: expected probabilities as predicted, got {table['predicted'].max():g}")
 
 
 def _row(declared: DeclaredRow, lines: pd.DataFrame) -> RowData:

@@ -4,6 +4,5 @@ run                      start it, resume it, load it; utility_reward: its utili
 directory, files         what is written where, and how; iteration_files, stored_classes: arrays, and classes by name
 lock                     one process continues it at a time
 answers_file, film       answers and episodes for other programs
-actor                    a policy to act with elsewhere, as stable-baselines3 has them
 simulated                who answers a run that needs nobody
 """

@@ -87,7 +87,7 @@ def read_questions(file: Path | str) -> tuple[PastQuestion, ...]:
 
     Args:
       file: as of `read_answers`, with any of the columns of `write_answers` besides, whose cells may be empty. Without
-        `question` the lines are counted from 1. Whom a question compared with whom is not in a file: `newcomer` is
+        `question` a line has the next number. Whom a question compared with whom is not in a file: `newcomer` is
         `second`.
 
     Raises:
@@ -101,7 +101,7 @@ def read_questions(file: Path | str) -> tuple[PastQuestion, ...]:
         try:
             counts = {column: _row_number(column, cells[column]) for column in COUNTS if cells[column]}
             seconds = _seconds(cells["seconds"]) if cells["seconds"] else None
-            asked, repeats = counts.get("question", len(past) + 1), counts.get("repeats")
+            asked, repeats = counts.get("question", max(past, default=0) + 1), counts.get("repeats")
             if asked in past:
                 raise ValueError(f"question: expected another number in each line, got {asked} twice")
             if repeats is not None and repeats not in past:

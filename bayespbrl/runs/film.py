@@ -20,7 +20,7 @@ from bayespbrl.envs.opening import (
 )
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.learner import Learner
-from bayespbrl.runs.actor import Actor
+from bayespbrl.policies.actor import Actor
 from bayespbrl.runs.files import written_aside
 
 FRAMES = 60  # pictures in the GIF of a drawn episode; where the environment renders itself, at most twice as many

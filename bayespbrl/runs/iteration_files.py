@@ -131,10 +131,11 @@ def _read_trajectories(data: xr.Dataset) -> tuple[Trajectory, ...]:
 
 def _estimate_groups(estimate: UtilityEstimate) -> dict[str, xr.DataTree]:
     """An estimate as groups: its own, and those of its posterior in ArviZ's schema."""
-    own = isinstance(getattr(estimate, "features", None), OwnFeatures)
-    groups = {"utility": to_tree(estimate, without=("posterior", "features") if own else ("posterior",))}
-    if own:  # φ is a function of the user's, which has to be passed again
-        groups["utility"].attrs["features"] = "other"
+    features = getattr(estimate, "features", None)
+    without = ("posterior", "features") if isinstance(features, OwnFeatures) else ("posterior",)
+    groups = {"utility": to_tree(estimate, without=without)}
+    if isinstance(features, OwnFeatures):  # φ is a function of the user's, which has to be passed again
+        groups["utility"].attrs |= {"features": "other", "feature_units": json.dumps(features.units)}
     if estimate.posterior is not None:
         small = stored(estimate.posterior)
         groups |= {name: small.children[name] for name in POSTERIOR_GROUPS if name in small.children}
@@ -150,7 +151,8 @@ def _read_estimate(tree: xr.DataTree, features: StateFeatures | None, known: Seq
     if utility.attrs.get("features") == "other":
         if features is None:
             raise ValueError("an estimate with features of your own: pass them again as features=")
-        given["features"] = OwnFeatures(features)  # as while the run learned
+        units = json.loads(utility.attrs.get("feature_units", "[]"))  # none of earlier versions
+        given["features"] = OwnFeatures(features, tuple(units))  # as while the run learned
     if "class" not in utility.attrs:  # by an earlier version: the posterior's groups say which of two it is
         numbers = {name: float(utility.attrs[name]) for name in ("discount", "scale") if name in utility.attrs}
         kind = "posterior" if "posterior" in given else "linear-program"

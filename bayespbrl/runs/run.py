@@ -16,11 +16,11 @@ from bayespbrl.envs.stepping import step_limit
 from bayespbrl.features import StateFeatures
 from bayespbrl.improvement.schedules import ConstantBound, Schedule
 from bayespbrl.learner import Learner
-from bayespbrl.policies import Policy, Sampler
+from bayespbrl.policies import Policy
+from bayespbrl.policies.actor import Actor
 from bayespbrl.policies.choice import fitting
 from bayespbrl.preferences import Preferences
 from bayespbrl.queries import QueryRule, highest_utility
-from bayespbrl.runs.actor import Actor
 from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.runs.directory import RunDirectory
 from bayespbrl.runs.stored_classes import classes_of, from_tree, to_tree
@@ -40,7 +40,7 @@ def start(
       env: as in `Learner`.
       directory: must not exist; a fresh one under `runs/` when None.
       **options: as in `Learner`. With `expert="other"` a person answers through code of your own: the learner uses its
-        settings for people, infers a side bias, and continues in Python only, not with `bayespbrl resume`.
+        settings for people, infers a side bias, and continues in Python or with `bayespbrl ask`, not with `resume`.
 
     Raises:
       ValueError: bad options, or a directory that exists; nothing is left behind then.
@@ -146,8 +146,8 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
                 raise ValueError(f"env: expected a time limit of {len(trajectory)} steps or more, got {limit}")
             check_of_space("states of the run", trajectory.states, learner.environment.observation_space)
             check_of_space("actions of the run", trajectory.actions, learner.environment.action_space)
-        if env is not None:  # of more states or actions than the run's, which those of the trajectories are among
-            fitting(learner.last_policy, learner.environment.observation_space, learner.environment.action_space)
+        # of more states or actions than the run's, which those of the trajectories are among
+        fitting(learner.last_policy, learner.environment.observation_space, learner.environment.action_space)
         for name, space in spaces_of(learner.given).items():
             if log.spaces.get(name, space) != space:
                 raise ValueError(f"env: expected the run's {name}, {log.spaces[name]}, got {space}")
@@ -200,16 +200,12 @@ class Run:
         Where updates are not checked, as under the paper preset, the newest, with its noise.
         `run.policy.act(observation)` is an action; both are of the environment as it was given.
         """
-        return self._actor(self.learner.policy)
+        return self.learner.actor()
 
     @property
     def last_policy(self) -> Actor:
         """The newest policy, with its noise."""
-        return self._actor(self.learner.last_policy)
-
-    def _actor(self, policy: Sampler) -> Actor:
-        given = self.learner.given
-        return Actor(policy, given.observation_space, given.action_space, np.random.default_rng())
+        return self.learner.actor(self.learner.last_policy)
 
     @property
     def preferences(self) -> Preferences:

@@ -35,7 +35,7 @@ def expert_of(learner: Learner) -> Expert:
 def _first_returns(learner: Learner) -> Float[np.ndarray, " episode"]:
     """Returns of the first policy, of what the expert is shown: whole trajectories, or clips."""
     questions, seed = learner.settings.questions, learner.settings.seed
-    environment, policy, steps = learner.environment, learner.first_policy(), learner.settings.rollouts.max_steps
+    environment, policy, steps = learner.environment, learner.state.first_policy, learner.settings.rollouts.max_steps
     key = jax.random.key(seed)
     if questions.clip_steps is None:
         return rollouts.returns(environment, policy, key=key, episodes=EPISODES, max_steps=steps).total

@@ -1,7 +1,7 @@
 """Presets: the options that differ from those of the parts, with one line of reason for each (docs/tuning.md).
 
 `default` is for any task: what it needs to know of one, it derives from the spaces and the horizon. `paper` is the
-paper's protocol.
+paper's protocol, on the paper's tasks, CartPole-v1 and Pendulum-v1 with what their rows say otherwise.
 """
 
 from collections.abc import Mapping
@@ -25,6 +25,7 @@ PAPER: dict[str, dict[str, Any]] = {
     },
     "swing-up": {
         "iterations": 40,  # the paper's
+        "trajectory_discount": 1.0,  # 0.98 lost more trials
         "kl_bound": 0.35,  # the paper's authors'
         "centres": 300,  # as good as 700 in a quarter of the time
         "bandwidth_factor": 0.5,  # the paper's authors'
@@ -61,6 +62,7 @@ PAPER: dict[str, dict[str, Any]] = {
     },
     "CartPole-v1": {
         "iterations": 15,  # not compared
+        "trajectory_discount": 1.0,  # all was measured with it
         "kl_bound": 0.1,  # not distinguishable from 0.3
         "discount": 0.995,  # 0.98 and 0.99 ended lower
     },
@@ -144,7 +146,7 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     """
     name = IDS.get(env, env)
     if checks.one_of("preset", chosen.get("preset", "default"), NAMES) == "paper":
-        return {"hyperparameters": "given"} | PAPER.get(name, {})
+        return {"hyperparameters": "given", "trajectory_discount": None} | PAPER.get(name, {})
     expert = chosen.get("expert", "return")
     people = not isinstance(expert, str) or expert not in SIMULATED
     options = DEFAULT | ({} if task is None else task.derived(people=people)) | TASKS.get(name, {})

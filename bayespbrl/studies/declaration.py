@@ -216,7 +216,10 @@ def _left_out(where: str, entry: Any, axes: list[dict[str, Options]]) -> list[li
     for axis, levels in zip(AXES, axes, strict=True):
         names = entry.get(axis, list(levels))
         if not isinstance(names, list) or not names or any(name not in list(levels) for name in names):
-            raise ValueError(f"{place}: expected a list of {axis} among {', '.join(levels)}, got {names!r}")
+            declared = (
+                f"a list of {axis} among {', '.join(levels)}" if levels != {"": {}} else f"no {axis}: none declared"
+            )
+            raise ValueError(f"{place}: expected {declared}, got {names!r}")
         chosen.append(names)
     return chosen
 

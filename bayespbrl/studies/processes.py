@@ -109,6 +109,8 @@ def _serve(calls: Connection) -> None:
 
 def _plain(error: Exception) -> Exception:
     """An error of a subclass, as what can be sent."""
+    if isinstance(error, MemoryError):  # NumPy's
+        return MemoryError(str(error))
     if not isinstance(error, OSError):
         return ValueError(str(error))
     return OSError(*error.args) if error.filename is None else OSError(*error.args[:2], error.filename)

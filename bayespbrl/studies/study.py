@@ -216,11 +216,12 @@ class Study:
             new = pd.read_csv(StringIO(text), dtype=str, keep_default_na=False)
             try:
                 kept = pd.read_csv(file, dtype=str, keep_default_na=False)
+                same = list(kept.columns) == list(new.columns)
+                stays = [trial not in read for trial in _trials(kept)] if same else []
             except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
                 raise ValueError(f"{file}: expected a table, got {checks.reason(error)}") from error
-            if list(kept.columns) == list(new.columns):
-                kept = kept[[trial not in read for trial in _trials(kept)]]
-                whole = pd.concat([new, kept])
+            if same:
+                whole = pd.concat([new, kept[stays]])
                 places = {row.levels: place for place, row in enumerate(self.declaration.rows)}
                 order = [(places.get(levels, len(places)), seed) for levels, seed in _trials(whole)]
                 text = whole.iloc[sorted(range(len(order)), key=order.__getitem__)].to_csv(

@@ -114,7 +114,7 @@ def measure_balancing(learner: Learner, directory: Path, *, max_steps: int) -> N
 
 def measure_first_policy(learner: Learner, directory: Path) -> None:
     """Measure the value of a learner's first policy, which is random, as an iteration's; in `first-policy.json`."""
-    returned = learner.cycle.evaluated(learner.first_policy())  # with its noise: without, it is not random
+    returned = learner.cycle.evaluated(learner.state.first_policy)  # with its noise: without, it is not random
     content = {"episodes": len(returned.total), "value": float(returned.total.mean())}
     write_file(directory / FIRST_POLICY_FILE, json.dumps(content, indent=1) + "\n")
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from xarray import DataTree
 
 from bayespbrl import checks
-from bayespbrl.features import DiffusionBasis, OwnFeatures, RadialBasis, StateFeatures
+from bayespbrl.features import DiffusionBasis, OwnFeatures, RadialBasis, StateFeatures, ranges
 from bayespbrl.models import Answers, PreferenceModel, linear_program, plain_chain, plain_draws, posterior_draws
 from bayespbrl.models.posterior_tree import bases_of
 from bayespbrl.preferences import known_pairs
@@ -97,6 +97,7 @@ def infer_utility(
     lapse_rate: float | None = None,
     likelihood: str = PreferenceModel.likelihood,
     tie_threshold: float | None = None,
+    scaled: bool = False,
     seed: int = 0,
 ) -> PosteriorUtility | LinearProgramUtility:
     """The posterior without a learner, from feature sums of anything that was compared, and the answers.
@@ -118,11 +119,14 @@ def infer_utility(
         length of 1. Steepness and threshold are in these units too.
       likelihood: `mixed` (eq. 8), `logistic` or `probit`.
       steepness, lapse_rate, tie_threshold: None: inferred, the threshold where there are ties.
+      scaled: whether each of the D columns is divided by its range over the n rows, and φ with it: for columns in
+        different units, of which a priori the largest would decide. Without, all weights are alike a priori (eq. 7) in
+        the units of the columns.
       seed: of the sampler.
 
     Returns:
-      the estimate; its `weights` are in the units of the features. The draws of `utility_weights` in its `posterior`
-      are of features divided by its `scales`.
+      the estimate; its `weights` are in the units of its `features`, the given ones or with `scaled` the divided ones.
+      The draws of `utility_weights` in its `posterior` are of these divided by its `scales`.
 
     Raises:
       ValueError: an unknown method, feature sums that are no finite matrix, pairs that name no row, and any other
@@ -139,6 +143,9 @@ def infer_utility(
     numbers = tuple((first, second) for first, second in every.tolist())
     comparisons = Comparisons((), numbers, checks.share("discount", discount), answers)
     chosen = _as_they_are if features is None else _checking(features)
+    if checks.boolean("scaled", scaled):
+        units = ranges(sums)
+        chosen, sums = OwnFeatures(chosen, tuple(units.tolist())), sums / units
     model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold)
     if method == "linear-program":
         return _by_linear_program(sums, comparisons, chosen)
