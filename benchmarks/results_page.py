@@ -35,6 +35,7 @@ from bayespbrl.studies.declaration import declared
 from bayespbrl.studies.machine import rounding
 from bayespbrl.studies.processes import trial_processes
 from bayespbrl.studies.rows import row_of, run_trial
+from bayespbrl.utility.inference import WITHOUT_POSTERIOR
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "RESULTS.md"
@@ -116,9 +117,11 @@ def write_figures(studies: dict[str, StudyData]) -> None:
 
 
 def cheapest(data: StudyData) -> RowData | None:
-    """The row whose trials take the least time; None without one that learns."""
+    """The row whose trials take the least time, of those with a posterior if there are any; None where none learns."""
     learned = [row for row in data.rows if not row.declared.untrained]
-    return min(learned, key=lambda row: float(row.lines["seconds"].sum() / len(row.seeds)), default=None)
+    sampled = [row for row in learned if row.declared.baseline is None]
+    sampled = [row for row in sampled if row.declared.options.get("utility") not in WITHOUT_POSTERIOR]
+    return min(sampled or learned, key=lambda row: float(row.lines["seconds"].sum() / len(row.seeds)), default=None)
 
 
 def repeated(row: RowData) -> int | None:

@@ -1,5 +1,6 @@
 """The contract that all four environments keep, the opening of any environment, and the pictures."""
 
+import sys
 import warnings
 from types import SimpleNamespace
 
@@ -350,3 +351,13 @@ def test_bounds_of_half_precision_may_be_wide():
         action_space = Box(-1, 1, (1,), dtype=np.float16)
 
     assert open_environment(Half(3)).action_space.dtype == np.float16
+
+
+def test_a_module_beside_the_user_that_is_not_found_is_given_a_hint(monkeypatch, tmp_path):
+    (tmp_path / "mazes_of_mine.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder])  # as the command has it
+    with pytest.raises(ValueError, match=r"No module named 'mazes_of_mine'; PYTHONPATH=\. lets it be found"):
+        open_environment("mazes_of_mine:Maze-v0")
+    with pytest.raises(ValueError, match=r"No module named 'nowhere_else'\)"):
+        open_environment("nowhere_else:Maze-v0")

@@ -117,9 +117,19 @@ def test_changes_win_over_presets_none_too():
     with pytest.raises(ValueError, match=r"kl_bound: expected .* got None"):
         settings_for("gridworld", kl_bound=None)
     assert settings_for("gridworld", iterations=7).iterations == 7
-    paper = settings_for("SomebodysEnv-v3", preset="paper", hyperparameters="inferred")
+    chosen = {"hyperparameters": "inferred", "trajectory_discount": 1.0}
+    paper = settings_for("SomebodysEnv-v3", preset="paper", **chosen)
     assert paper == Settings("SomebodysEnv-v3", preset="paper")
     assert settings_for("SomebodysEnv-v3") == Settings.from_options("SomebodysEnv-v3", DEFAULT)
+
+
+def test_the_papers_protocol_discounts_trajectories_as_q():
+    """Eq. 1 has one discount; three tasks were measured with another."""
+    discounts = {
+        name: (settings := settings_for(name, preset="paper")).trajectory_discount / settings.critic.discount
+        for name in ("gridworld", "bicycle", "acrobot", "SomebodysEnv-v3", "swing-up", "Pendulum-v1", "CartPole-v1")
+    }
+    assert [name for name, ratio in discounts.items() if ratio != 1] == ["swing-up", "Pendulum-v1", "CartPole-v1"]
 
 
 COMPARED = {"against_kept": True, "noise_free": True}

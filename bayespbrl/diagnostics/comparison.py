@@ -31,7 +31,7 @@ def compare_likelihoods(
     Args:
       differences: ψ(preferred) − ψ(dominated), shape (K, D), or (C, K, D) under C settings of the features; eq. 8 keeps
         the full K.
-      candidates: models by name.
+      candidates: models by name; `PreferenceModel(steepness=None, lapse_rate=None)` is what `infer_utility` fits.
       folds: >= 2, assigned at random; leave-one-out with as many folds as answers.
       groups: the number of the answer that each row follows from, shape (K,), never decreasing: rows of one answer are
         left out together. Every row is an answer of its own by default.

@@ -126,7 +126,8 @@ def infer_utility(
 
     Returns:
       the estimate; its `weights` are in the units of its `features`, the given ones or with `scaled` the divided ones.
-      The draws of `utility_weights` in its `posterior` are of these divided by its `scales`.
+      The draws of `utility_weights` in its `posterior` are of these divided by its `scales`, and so are the differences
+      that `bayespbrl.diagnostics` take.
 
     Raises:
       ValueError: an unknown method, feature sums that are no finite matrix, pairs that name no row, and any other
