@@ -161,6 +161,14 @@ def test_a_published_curve_stands_beside_the_values_after_as_many_answers():
     assert f"| 13 | 0.503 [0.503 … 0.503] | {middle:.3f} [{low:.3f} … {high:.3f}] |" in table
 
 
+def test_the_cell_that_is_run_again_is_of_what_a_study_is_about():
+    page = benchmark("results_page")
+    rows = {name: page.cheapest(data).declared for name, data in page.committed().items()}
+    assert {name for name, row in rows.items() if row.baseline} == {"pf", "epmc"}
+    without = {name for name, row in rows.items() if row.options.get("utility") in ("known-reward", "linear-program")}
+    assert without == set(page.CHAINS_OTHERWISE)
+
+
 @pytest.mark.slow
 def test_of_a_long_trial_the_first_iterations_are_run_again(capsys):
     page = benchmark("results_page")
