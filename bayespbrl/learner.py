@@ -38,7 +38,7 @@ class Learner:
 
     Args:
       env: a short name (`gridworld`, …), a gymnasium id, or an environment.
-      features: φ of your own, from observations (N, S) to (N, D); None: drawn as the settings say.
+      features: φ of your own, from observations (N, S) to (N, D), in any units; None: drawn as the settings say.
       policy: a kind of policy by name, or a first policy of your own, where the updates start; it is not kept itself.
       schedule: of the KL bound by name, or one of your own (`bayespbrl.improvement.schedules`).
       query: the rule for questions by name, or one of your own (`bayespbrl.queries`).
