@@ -281,8 +281,8 @@ class Learner:
         while (query := self._question_for(answerer, progress)) is not None:
             began = time.perf_counter()
             answer = parse_answer(expert(*query.trajectories))
-            took = getattr(expert, "seconds", time.perf_counter() - began)
-            seconds = None if answerer is None else took
+            elapsed, own = time.perf_counter() - began, getattr(expert, "seconds", None)
+            seconds = None if answerer is None else own if isinstance(own, float) else elapsed
             vain = vain + 1 if answer is Answer.UNDO and not self.state.may_undo(answerer) else 0
             if vain == VAIN_UNDOS:
                 raise ValueError(f"expert: expected an answer, because there is none to take back, got {vain} undos")

@@ -500,13 +500,37 @@ def test_features_of_the_users_own_are_divided_by_their_ranges():
         return np.column_stack([states[:, 0], 5 + 2 * states[:, 0], np.full(len(states), -3.0), 0 * states[:, 0]])
 
     states = np.array([[-1.0], [0.0], [3.0]])
-    own = OwnFeatures.in_any_units(features, states)
+    own = OwnFeatures.in_any_units(features, states, of_equal_lengths=True)
     assert own.units == (4, 8, 3, 1)
     np.testing.assert_array_equal(own(states), features(states) / [4, 8, 3, 1])
     np.testing.assert_array_equal(OwnFeatures(features)(states), features(states))
+    assert OwnFeatures.in_any_units(features, states, of_equal_lengths=False).units == (3, 11, 3, 1)
     corners = np.eye(5)[[0, 1, 4, 0, 0]]
-    np.testing.assert_array_equal(OwnFeatures.in_any_units(lambda s: corners[s], np.arange(5))(np.arange(5)), corners)
+    for alike in (True, False):
+        cells = OwnFeatures.in_any_units(lambda s: corners[s], np.arange(5), of_equal_lengths=alike)
+        np.testing.assert_array_equal(cells(np.arange(5)), corners)
     with pytest.raises(ValueError, match="features: expected 4 for each state, as before, got 1"):
         OwnFeatures(lambda s: s, own.units)(states)
     with pytest.raises(ValueError, match="features: ranges: expected finite entries"):
-        OwnFeatures.in_any_units(lambda s: s, np.array([[-1.7e308], [1.7e308]]))
+        OwnFeatures.in_any_units(lambda s: s, np.array([[-1.7e308], [1.7e308]]), of_equal_lengths=True)
+
+
+@pytest.mark.parametrize("equal", [True, False])
+@pytest.mark.parametrize("change", [1e-7, 1e-3, 0.1])
+def test_a_feature_of_the_users_own_that_hardly_changes_does_no_harm(change, equal):
+    """As the square of a cosine and of a sine in single precision together, or a height that has settled."""
+    rng = np.random.default_rng(0)
+    lengths = np.full(60, 100) if equal else rng.integers(50, 200, 60)
+    walks = [rng.normal(rng.normal(0, 0.3), 1, (length + 1, 2)) for length in lengths]
+    trajectories = [Trajectory(walk, np.zeros((len(walk) - 1, 1)), np.zeros(len(walk) - 1)) for walk in walks]
+    returns = np.array([walk[1:, 0].sum() for walk in walks])
+
+    def features(states):
+        return np.column_stack([1000 * states[:, 0], 1 + change * np.tanh(states[:, 1])])
+
+    source = FeatureSource(Box(-9, 9, (2,)), Box(-1, 1, (1,)), own=features)
+    own = source.of_states(trajectories, RadialBasisOptions(10), rng=rng)
+    sums = trajectory_features(trajectories, own, discount=1.0)
+    pairs = [(i, j) if returns[i] > returns[j] else (j, i) for i, j in zip(range(12), range(12, 24), strict=True)]
+    utility = infer_utility(sums, pairs)
+    assert np.corrcoef(utility.utilities(sums[24:]), returns[24:])[0, 1] > 0.9

@@ -464,7 +464,7 @@ def test_features_of_the_users_own_constrain_the_states_alike_in_any_units():
     policy, steps, options = few_samples()
 
     def features_in(unit):
-        return OwnFeatures.in_any_units(lambda s: s * [1.0, unit], steps.states)
+        return OwnFeatures.in_any_units(lambda s: s * [1.0, unit], steps.states, of_equal_lengths=True)
 
     plain, mixed = (
         improve(policy, steps, steps.actions[:, 0], **options | {"state_features": features_in(unit)})

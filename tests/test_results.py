@@ -455,6 +455,7 @@ def test_a_damaged_line_is_no_answer(made):
         ("first", "1.7", "expected True or False as first"),
         ("first", "", "expected True or False as first"),
         ("predicted", "1.7", "expected probabilities as predicted, got 1.7"),
+        ("predicted", "-0.5", "expected probabilities as predicted, got -0.5"),
         ("seed", "", "expected a number as seed in each line, got none in 1 line"),
     ):
         assert told in told_of(made, "answers.csv", with_cell(columns.index(column), text))

@@ -525,3 +525,6 @@ def test_scaled_columns_without_rows_or_answers():
     assert infer_utility(np.zeros((0, 2)), [], scaled=True).weights.tolist() == [[0, 0]]
     with pytest.raises(ValueError, match="scaled: expected true or false, got 1"):
         infer_utility(np.eye(2), [(0, 1)], scaled=1)
+    drawn = RadialBasis(np.zeros((1, 1)), np.ones(1), np.full(1, np.inf))
+    with pytest.raises(ValueError, match="scaled: expected false with RadialBasis"):
+        infer_utility(np.ones((2, 1)), [(0, 1)], features=drawn, scaled=True)

@@ -115,9 +115,11 @@ class FeatureSource:
 
         Where all are equally long and none ended by itself, there is no constant feature.
         """
+        alike = len({len(each) for each in trajectories}) == 1 and not any(each.terminated for each in trajectories)
         if self.own is not None:
             observed = np.concatenate([trajectory.states for trajectory in trajectories])
-            return OwnFeatures.in_any_units(self.own, np.unique(observed) if observed.ndim == 1 else observed)
+            states = np.unique(observed) if observed.ndim == 1 else observed
+            return OwnFeatures.in_any_units(self.own, states, of_equal_lengths=alike)
         space = self.observation_space
         if options.diffusion and isinstance(space, Discrete):
             if space.n > MOST_CONNECTED:
@@ -125,7 +127,7 @@ class FeatureSource:
             return diffusion_basis(trajectories, int(space.n))
         if options.standardised and isinstance(space, Discrete):
             return standardised(trajectories, int(space.n))
-        if len({len(each) for each in trajectories}) == 1 and not any(each.terminated for each in trajectories):
+        if alike:
             options = replace(options, constant=False)
         observed = np.concatenate([trajectory.states for trajectory in trajectories])
         drawn = draw_state_features(self.observation_space, observed, self._periodic(options), rng=rng)

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from bayespbrl.checks import dense, finite, function
-from bayespbrl.kernels import beyond_rounding
 
+SINGLE_PRECISION = 1e-6  # ten times its rounding
 StateFeatures = Callable[[Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
 StateActionFeatures = Callable[[Shaped[np.ndarray, "n ..."], Shaped[np.ndarray, "n ..."]], Shaped[np.ndarray, "n d"]]
 
@@ -41,9 +41,16 @@ class OwnFeatures:
     units: tuple[float, ...] = ()
 
     @classmethod
-    def in_any_units(cls, function: StateFeatures, states: Shaped[np.ndarray, "n ..."]) -> Self:
-        """Features divided by their `ranges` over observed states, so that all weights mean as much a priori."""
-        return cls(function, tuple(ranges(checked_features(function, states)).tolist()))
+    def in_any_units(
+        cls, function: StateFeatures, states: Shaped[np.ndarray, "n ..."], *, of_equal_lengths: bool
+    ) -> Self:
+        """Features divided by what they are over observed states, so that all weights mean as much a priori.
+
+        Among trajectories `of_equal_lengths` only their `ranges` tell, because what is the same everywhere cancels.
+        Otherwise it is their `sizes`: one that hardly changes, over its range, would count nothing but the steps.
+        """
+        values = checked_features(function, states)
+        return cls(function, tuple((ranges(values) if of_equal_lengths else sizes(values)).tolist()))
 
     def __call__(self, states: Shaped[np.ndarray, "n ..."]) -> Float[np.ndarray, "n d"]:
         """`checked_features` of the function, in the units."""
@@ -55,16 +62,20 @@ class OwnFeatures:
         return values / np.array(self.units)
 
 
+def sizes(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
+    """Largest absolute value of each column; 1 where all are zero."""
+    largest = np.abs(values).max(axis=0, initial=0.0)
+    return np.where(largest > 0, largest, 1.0)
+
+
 def ranges(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
-    """Greatest less least value of each column; of one that is constant its size, or 1 if it is zero."""
+    """Greatest less least value of each column; its size where that is rounding, of single precision too."""
     if not len(values):
-        return np.ones(values.shape[1])
+        return sizes(values)
     with np.errstate(over="ignore"):
         width = np.ptp(values, axis=0)
     finite("features: ranges", width)  # of numbers near the largest
-    width = beyond_rounding(width, values)
-    width = np.where(width > 0, width, np.abs(values).max(axis=0))
-    return np.where(width > 0, width, 1.0)
+    return np.where(width > SINGLE_PRECISION * sizes(values), width, sizes(values))
 
 
 def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "n ..."]:

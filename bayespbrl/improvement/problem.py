@@ -10,8 +10,9 @@ from gymnasium import Space
 from jaxtyping import Float, Int, Shaped
 
 from bayespbrl import checks
-from bayespbrl.features import StateActionFeatures, StateFeatures
+from bayespbrl.features import OwnFeatures, StateActionFeatures, StateFeatures
 from bayespbrl.improvement.q_function import Critic
+from bayespbrl.policies.samples import location_and_deviation
 from bayespbrl.trajectories import Trajectory, Transitions
 from bayespbrl.utility.estimate import UtilityEstimate
 
@@ -114,8 +115,17 @@ class UpdateProblem:
 
     @cached_property
     def constrained(self) -> Float[np.ndarray, "v d"]:
-        """φ(s) of the `visited` states, evaluated once for all updates."""
-        return self.state_features(self.visited[0])
+        """φ(s) of the `visited` states, evaluated once for all updates.
+
+        Features of the user's own are divided by their standard deviations: the constraint leaves out what is small
+        beside the largest.
+        """
+        states, shares = self.visited
+        features = self.state_features(states)
+        if not isinstance(self.state_features, OwnFeatures):
+            return features
+        deviation = location_and_deviation(features, shares)[1]
+        return features / np.where(deviation > 0, deviation, 1.0)
 
 
 def step_utilities(

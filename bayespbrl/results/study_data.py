@@ -198,8 +198,8 @@ def _check(file: Path, table: pd.DataFrame) -> None:
         raise ValueError(f"{file}: expected one line for each {key[-1]}, got two for {told}")
     if "first" in table and table["first"].dtype != bool:
         raise ValueError(f"{file}: expected True or False as first in each line, got others")
-    if "predicted" in table and not table["predicted"].dropna().between(0, 1).all():
-        raise ValueError(f"{file}: expected probabilities as predicted, got {table['predicted'].max():g}")
+    if "predicted" in table and len(bad := table["predicted"][~table["predicted"].fillna(0).between(0, 1)]):
+        raise ValueError(f"{file}: expected probabilities as predicted, got {bad.iloc[0]:g}")
 
 
 def _row(declared: DeclaredRow, lines: pd.DataFrame) -> RowData:

@@ -145,6 +145,8 @@ def infer_utility(
     comparisons = Comparisons((), numbers, checks.share("discount", discount), answers)
     chosen = _as_they_are if features is None else _checking(features)
     if checks.boolean("scaled", scaled):
+        if isinstance(features, RadialBasis | DiffusionBasis):
+            raise ValueError(f"scaled: expected false with {type(features).__name__}, which has no units, got true")
         units = ranges(sums)
         chosen, sums = OwnFeatures(chosen, tuple(units.tolist())), sums / units
     model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold)

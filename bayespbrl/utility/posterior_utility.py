@@ -28,7 +28,7 @@ class PosteriorUtility:
     Mean, draws, `quality` and `likelihood` are all of that one posterior.
 
     Attributes:
-      features: φ as given; a user's own over its ranges (`OwnFeatures.units`) in a learner.
+      features: φ as given; a user's own in a learner over its `OwnFeatures.units`.
       multiples: of its bandwidths, one row for each of C settings, shape (C, S); S = 0 for features without any. With
         a feature of the effort one column more: 1 where it counts, else 0.
       scales: what the differences were divided by under each setting, shape (C,): a draw over it is in the units of φ.
