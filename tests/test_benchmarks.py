@@ -158,7 +158,9 @@ def test_a_published_curve_stands_beside_the_values_after_as_many_answers():
     after = lines[(lines["methods"] == "pf") & (lines["answers"] == 13)]["value"] / 294.8125
     low, middle, high = np.quantile(after, [0.25, 0.5, 0.75])
     assert len(after) == 20
-    assert f"| 13 | 0.503 [0.503 … 0.503] | {middle:.3f} [{low:.3f} … {high:.3f}] |" in table
+    (line,) = [line.split(" | ") for line in table if line.startswith("| 13 |")]
+    assert line[1] == "0.503 [0.503 … 0.503]"
+    assert line[table[0].split(" | ").index("pf, here")] == f"{middle:.3f} [{low:.3f} … {high:.3f}]"
 
 
 def test_the_cell_that_is_run_again_is_of_what_a_study_is_about():
