@@ -227,9 +227,8 @@ def _spec(environment: str | EnvSpec) -> EnvSpec:
             import_module(module)
         return gymnasium.spec(name)
     except Exception as error:  # a module of the user's may raise anything
-        here = isinstance(error, ModuleNotFoundError) and error.name == module in {
-            path.stem for path in Path().glob("*.py")
-        }
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        here = missing == module and module in {path.stem for path in Path().glob("*.py")}
         hint = "; PYTHONPATH=. lets it be found" if here else ""
         raise ValueError(
             f"environment: expected {', '.join(SHORT_NAMES)} or a registered gymnasium id, got {environment!r} "

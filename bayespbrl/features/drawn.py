@@ -117,7 +117,7 @@ class FeatureSource:
         """
         alike = len({len(each) for each in trajectories}) == 1 and not any(each.terminated for each in trajectories)
         if self.own is not None:
-            observed = np.concatenate([trajectory.states for trajectory in trajectories])
+            observed = _observed(trajectories)
             states = np.unique(observed) if observed.ndim == 1 else observed
             return OwnFeatures.in_any_units(self.own, states, of_equal_lengths=alike)
         space = self.observation_space
@@ -129,8 +129,7 @@ class FeatureSource:
             return standardised(trajectories, int(space.n))
         if alike:
             options = replace(options, constant=False)
-        observed = np.concatenate([trajectory.states for trajectory in trajectories])
-        drawn = draw_state_features(self.observation_space, observed, self._periodic(options), rng=rng)
+        drawn = draw_state_features(self.observation_space, _observed(trajectories), self._periodic(options), rng=rng)
         if not (options.effort and isinstance(drawn, RadialBasis) and isinstance(self.action_space, Box)):
             return drawn
         return replace(
@@ -146,6 +145,11 @@ class FeatureSource:
 
     def _periodic(self, options: RadialBasisOptions) -> RadialBasisOptions:
         return replace(options, period=self.period)
+
+
+def _observed(trajectories: Sequence[Trajectory]) -> Shaped[np.ndarray, "n ..."]:
+    """All states of the trajectories."""
+    return np.concatenate([trajectory.states for trajectory in trajectories])
 
 
 def _effort(drawn: RadialBasis, space: Box, actions: Float[np.ndarray, "n a"]) -> tuple[float, ...]:

@@ -57,8 +57,7 @@ class OwnFeatures:
         values = checked_features(self.function, states)
         if not self.units:
             return values
-        if values.shape[1] != len(self.units):
-            raise ValueError(f"features: expected {len(self.units)} for each state, as before, got {values.shape[1]}")
+        _check_number(values, len(self.units))
         return values / np.array(self.units)
 
 
@@ -70,12 +69,13 @@ def sizes(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
 
 def ranges(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
     """Greatest less least value of each column; its size where that is rounding, of single precision too."""
+    largest = sizes(values)
     if not len(values):
-        return sizes(values)
+        return largest
     with np.errstate(over="ignore"):
         width = np.ptp(values, axis=0)
     finite("features: ranges", width)  # of numbers near the largest
-    return np.where(width > SINGLE_PRECISION * sizes(values), width, sizes(values))
+    return np.where(width > SINGLE_PRECISION * largest, width, largest)
 
 
 def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "n ..."]:
@@ -84,6 +84,10 @@ def linear(features: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "n ..
     Raises:
       ValueError: features of another length than the weights, as a function of the user's may return.
     """
-    if features.shape[1] != len(weights):
-        raise ValueError(f"features: expected {len(weights)} for each state, as before, got {features.shape[1]}")
+    _check_number(features, len(weights))
     return np.asarray(features @ weights)  # u = wᵀφ(s) (paper, step 2), wᵀψ(τ) (eq. 4)
+
+
+def _check_number(features: np.ndarray, number: int) -> None:
+    if features.shape[1] != number:
+        raise ValueError(f"features: expected {number} for each state, as before, got {features.shape[1]}")

@@ -188,9 +188,10 @@ def _check(file: Path, table: pd.DataFrame) -> None:
     for name in ("seed", "question", "iteration", "answers", "value", "predicted"):
         if name in table and not pd.api.types.is_numeric_dtype(table[name]):
             raise ValueError(f"{file}: expected numbers as {name}, got {table[name].dtype}")
-    key = [*AXES, "seed", "question" if "question" in table else "iteration"]
-    for name in key:
-        if (gaps := int(table[name].isna().sum())) and name not in AXES:
+    numbers = ["seed", "question" if "question" in table else "iteration"]
+    key = [*AXES, *numbers]
+    for name in numbers:
+        if gaps := int(table[name].isna().sum()):
             raise ValueError(f"{file}: expected a number as {name} in each line, got none in {gaps} lines")
     if (again := table.duplicated(key)).any():
         line = table[again].iloc[0]
