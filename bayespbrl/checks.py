@@ -59,6 +59,13 @@ def positive(name: str, value: Any) -> float:
     return float(value)
 
 
+def between(name: str, value: Any, least: float, most: float) -> float:
+    """`value` as a float, where it is a number in [`least`, `most`]."""
+    if not (_is_number(value) and least <= value <= most):
+        raise ValueError(f"{name}: expected a number from {least:g} to {most:g}, got {value!r}")
+    return float(value)
+
+
 def non_negative(name: str, value: Any) -> float:
     """`value` as a float, where it is finite and >= 0."""
     if not (_is_number(value) and value >= 0):
@@ -140,6 +147,8 @@ def matrix(name: str, values: Any, *, columns: int | None = None) -> np.ndarray:
         raise ValueError(f"{name}: expected rows of numbers, all equally long, got {shortened(values)}") from error
     if np.ma.is_masked(values) or np.iscomplexobj(given):
         raise ValueError(f"{name}: expected real numbers, got masked or complex entries")
+    if given.dtype.kind in "mM":
+        raise ValueError(f"{name}: expected real numbers, got dates or times; say in which unit, from which day")
     if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
         raise ValueError(f"{name}: expected shape (N, {'D' if columns is None else columns}), got {array.shape}")
     finite(name, array)

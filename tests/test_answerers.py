@@ -23,6 +23,7 @@ from bayespbrl import (
     start,
 )
 from bayespbrl.diagnostics import people
+from bayespbrl.diagnostics.estimates import predicted_answer
 from bayespbrl.diagnostics.report import document as report_document
 from bayespbrl.diagnostics.report.contents import read_contents
 from bayespbrl.diagnostics.report.people import people_warnings
@@ -30,6 +31,7 @@ from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.events import Entry, LearnerState, apply
 from bayespbrl.models import Answers, PreferenceModel, posterior_draws, sample_posterior
 from bayespbrl.models.posterior_tree import utility_margins
+from bayespbrl.people.views import said_of
 from bayespbrl.preferences import PastQuestion, Source
 from bayespbrl.questions import LEAST_BETWEEN, Questions, repeated
 from bayespbrl.runs.answers_file import write_answers
@@ -139,13 +141,15 @@ def test_all_that_follows_from_an_answer_is_its_answerers_and_only_what_was_show
     ]
 
 
-def test_several_answerers_are_numbered_by_their_first_answer_and_one_is_not():
+def test_several_answerers_are_numbered_by_their_first_answer_and_nobody_without_a_name_is():
     trajectories, pairs = [object()] * 4, [(0, 1), (2, 1), (3, 0)]
     several = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob", "Ada", "Bob"])
     checked = several.answers.checked(3)
     assert (checked.answerers.tolist(), checked.names) == ([0, 1, 0], ("Bob", "Ada"))
-    one = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob"] * 3)
-    assert one.answers == Comparisons.among(trajectories, pairs, discount=1.0).answers
+    one = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=["Bob"] * 3).answers.checked(3)
+    assert (one.answerers.tolist(), one.names) == ([0, 0, 0], ("Bob",))
+    nobody = Comparisons.among(trajectories, pairs, discount=1.0, answered_by=[""] * 3)
+    assert nobody.answers == Comparisons.among(trajectories, pairs, discount=1.0).answers
 
 
 def test_a_missing_name_as_tables_have_it_is_refused_and_names_of_any_sequence_are_taken():
@@ -380,6 +384,31 @@ def test_lapse_rates_and_biases_are_each_persons_own():
 
 
 @pytest.mark.slow
+def test_the_habits_of_the_only_person_so_far_are_not_ascribed_to_another():
+    """Ada takes the first shown ten times; what is said of a question counts this for her alone."""
+    options = QUICK | {"utility": "posterior-mean", "hyperparameters": "inferred", "expert": "other", "repeats": 0}
+    learner = Learner("gridworld", **options | {"iterations": 11})
+    for _ in range(10):
+        learner.ask()
+        learner.tell(["first"], answerer="Ada")
+    (query,) = learner.ask()
+    estimate, (first, second) = learner.estimate, query.trajectories
+    shown, other_way = (
+        {name: predicted_answer(estimate, *both, answerer=name)[0] for name in ("Ada", "Bob")}
+        for both in ((first, second), (second, first))
+    )
+    assert shown["Bob"] == pytest.approx(1 - other_way["Bob"], abs=1e-9)
+    assert shown["Ada"] + other_way["Ada"] > 1.2
+    for name in ("Ada", "Bob"):
+        said = said_of(query, learner.state, name)[0]
+        assert said["sure"] == pytest.approx(max(shown[name], 1 - shown[name]), abs=0.03)
+    (of_ada, likely), (of_bob, _) = (said_of(query, learner.state, name) for name in ("Ada", "Bob"))
+    assert likely[0] is Answer.FIRST
+    assert of_ada["sure"] > of_bob["sure"] + 0.1
+    assert of_ada["worth"] == of_bob["worth"]
+
+
+@pytest.mark.slow
 def test_who_answered_after_the_last_fit_has_no_lapse_rate_yet():
     tree = sample_posterior(np.array([[1.0], [0.8]]), lapse_rate=None, num_samples=100)  # Ada's answers alone
     table = people(PAST, tree)
@@ -494,7 +523,7 @@ def test_the_utility_without_one_person_is_that_of_the_others(answered_by_two):
     assert all(left.pairs[source.number] in run.preferences.pairs for source in left.sources if not source.tied)
     estimate = run.estimate_without("Bob")
     assert estimate.quality.pairs == len(left.pairs)
-    assert "answerer" not in estimate.posterior["posterior"].coords
+    assert estimate.posterior["posterior"].coords["answerer"].values.tolist() == ["Ada"]
     with pytest.raises(ValueError, match="answerer: expected one of 'Ada', 'Bob', got 'Eve'"):
         run.estimate_without("Eve")
 

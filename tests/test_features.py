@@ -515,6 +515,16 @@ def test_features_of_the_users_own_are_divided_by_their_ranges():
         OwnFeatures.in_any_units(lambda s: s, np.array([[-1.7e308], [1.7e308]]), of_equal_lengths=True)
 
 
+def test_features_of_the_users_own_are_divided_by_ranges_where_lengths_are_equal_however_trajectories_end():
+    source = FeatureSource(STATES, TORQUE, own=lambda states: 290 + 10 * states)
+    for lengths, units in (((2, 2), (10, 10)), ((2, 3), (300, 300))):
+        walks = [
+            Trajectory(np.linspace([0, 0], [1, 1], length + 1), np.zeros((length, 1)), np.zeros(length), ended)
+            for length, ended in zip(lengths, (True, False), strict=True)
+        ]
+        assert source.of_states(walks, RadialBasisOptions(8), rng=np.random.default_rng(0)).units == units
+
+
 @pytest.mark.parametrize("equal", [True, False])
 @pytest.mark.parametrize("change", [1e-7, 1e-3, 0.1])
 def test_a_feature_of_the_users_own_that_hardly_changes_does_no_harm(change, equal):

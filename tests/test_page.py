@@ -247,7 +247,7 @@ def test_a_key_that_was_held_before_the_question_came_answers_nothing(browser, g
 
 def test_what_the_learner_knows_of_an_answer_is_shown_and_that_one_can_stop(browser, gridworld, monkeypatch):
     said = {"sure": 0.987, "worth": 0.004, "advice": "You can stop here."}
-    monkeypatch.setattr("bayespbrl.people.views.said_of", lambda query, state: (said, UNKNOWN))
+    monkeypatch.setattr("bayespbrl.people.views.said_of", lambda query, state, answerer: (said, UNKNOWN))
     with tab(browser, gridworld) as opened:
         press(opened, "tie")  # what was drawn before says nothing
         press(opened, "tie")

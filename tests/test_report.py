@@ -195,8 +195,8 @@ def test_probabilities_of_answers_are_those_of_the_posteriors_before_and_after(g
     likelihood = np.exp(run.posterior["log_likelihood"]["answers"].values).mean(axis=(0, 1))
     np.testing.assert_allclose(table["before"][:2], 0.5)  # the prior knows nothing
     np.testing.assert_array_equal(table["said"] == "tie", [False, False, True, False])
-    assert np.isnan(table["before"][2])
-    assert np.isnan(table["probability"][2])
+    assert np.isnan(table["before"][2])  # the first tie, which no posterior expected
+    assert float(table["probability"][2]) == pytest.approx(likelihood[-1])
     np.testing.assert_allclose(table["probability"].values[[0, 1]], likelihood[:2])
     # the third iteration's answer, by the estimate of the second
     log = [json.loads(line) for line in (gridworld_run / "events.jsonl").read_text().splitlines()]
@@ -264,7 +264,7 @@ def test_the_first_answers_which_no_posterior_predicted_are_not_scored(contents)
     first = [answer for answer in contents.answers if answer.iteration == 1]
     assert first
     assert all(answer.predicted == 0.5 for answer in first)
-    stated = [answer for answer in contents.answers if answer.iteration > 1 and answer.row is not None]
+    stated = [answer for answer in contents.answers if answer.iteration > 1 and answer.states_order]
     assert report_tables.prequential_table(contents).sizes["prediction"] == len(stated)
 
 
@@ -570,12 +570,25 @@ def test_a_tie_is_said_to_be_used_and_the_asked_pair_is_found_among_those_of_its
     start(directory, iterations=2).run(lambda first, second: next(said))
     contents = read_contents(directory)
     text = read(write_report(directory)).text
-    assert "the posterior learns from it that the two are alike" in text
     assert "not used by the model" not in text
     assert any("ties: they say that two are alike" in each for each in warned(contents))
     for answer in contents.answers:
-        if answer.row is not None:
-            assert {*contents.preferences.pairs[answer.row]} == {answer.first, answer.second}
+        among = contents.preferences.pairs if answer.states_order else contents.preferences.ties
+        assert {*among[answer.row]} == {answer.first, answer.second}
+
+
+@pytest.mark.slow
+def test_where_all_answers_are_ties_each_after_the_first_has_a_probability_beforehand(tmp_path):
+    directory = tmp_path / "run"
+    start(directory, iterations=3).run(lambda first, second: "tie")
+    contents = read_contents(directory)
+    tied = contents.answers[-1]
+    assert 0 < tied.before == 1 - tied.stated < 1
+    assert 0.5 < float(report_tables.answers_table(contents)["probability"][-1]) < 1
+    text = read(write_report(directory)).text
+    assert "No answer that says which is better could be predicted before it was given." in text
+    assert "ties" in text[text.index("Posterior predictive checks") :]
+    assert "None of them says which is better." in text
 
 
 @pytest.mark.parametrize(

@@ -493,7 +493,7 @@ def test_predictions_are_those_that_the_report_shows_and_old_runs_are_read_anew(
     assert call(monkeypatch, "results", tmp_path / "run") == 0
     kept = pd.read_csv(tmp_path / "run" / "answers.csv")
     shown = [a for a in read_contents(tmp_path / "run" / "gridworld" / "seed-2970").answers if a.iteration > 1]
-    np.testing.assert_allclose(kept["predicted"], [a.predicted for a in shown if a.row is not None], rtol=1e-5)
+    np.testing.assert_allclose(kept["predicted"], [a.predicted for a in shown if a.states_order], rtol=1e-5)
     page = (tmp_path / "run" / "results.md").read_text()
     assert "Calibration" in page
     assert (tmp_path / "out" / "results.md").read_text() == page

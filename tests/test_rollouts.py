@@ -1,6 +1,8 @@
 """Step 3: compiled rollouts, the gymnasium interface, and what happens when either goes wrong."""
 
+import pickle
 import re
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import pairwise
 from unittest import mock
@@ -436,6 +438,24 @@ def test_observations_of_a_wrapper_have_no_period_of_the_dynamics():
     assert opening.environment_attribute(made, "observation_period") is not None
     wrapped = open_environment(gymnasium.wrappers.TimeAwareObservation(made))
     assert opening.environment_attribute(wrapped, "observation_period") is None
+
+
+def test_a_copy_of_an_environment_is_stepped_as_the_original():
+    for env in (open_environment("CartPole-v1"), open_environment("FrozenLake-v1")):
+        for copied in (deepcopy(env), pickle.loads(pickle.dumps(env))):
+            assert opening.made_from(copied) == opening.made_from(env) is not None
+    wrapped = gymnasium.wrappers.TimeAwareObservation(open_environment("CartPole-v1"))
+    assert opening.made_from(wrapped) is None
+    flat = open_environment(gymnasium.wrappers.ReshapeObservation(gymnasium.make("CartPole-v1"), (2, 2)))
+    again = deepcopy(flat)
+    assert opening.as_given(again) is again.env
+
+
+def test_an_observation_of_too_many_numbers_is_refused():
+    picture = gymnasium.wrappers.ReshapeObservation(gymnasium.make("CartPole-v1"), (2, 2))
+    picture.observation_space = gymnasium.spaces.Box(0, 255, (84, 84), np.uint8)
+    with pytest.raises(ValueError, match="CartPole-v1: expected observations of at most 1000 numbers, got 7056"):
+        open_environment(picture)
 
 
 @dataclass

@@ -141,8 +141,11 @@ class Known:
     def trajectory_draws(self, trajectories, *, number):
         return self.draws
 
-    def likelihood(self, number):
+    def likelihood(self, number, *, answerer=None):
         return Logistic(4.0)
+
+    def side_biases(self, number, *, answerer):
+        return None
 
     def tie_thresholds(self, number):
         return None

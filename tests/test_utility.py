@@ -410,6 +410,7 @@ BAD_ARGUMENTS = [
     ({"seed": "x"}, "seed: expected a whole number >= 0"),
     ({"feature_sums": np.ma.masked_less(ITEMS, 1)}, "feature_sums: expected real numbers, got masked or complex"),
     ({"feature_sums": np.asarray(ITEMS) * 1j}, "feature_sums: expected real numbers, got masked or complex"),
+    ({"feature_sums": np.zeros((3, 1), "datetime64[D]")}, "feature_sums: expected real numbers, got dates or times"),
     ({"prior_scale": 10**400}, "prior_scale: expected"),
     ({"answerers": ["a", "b"]}, "answerers: expected 1 names, one for each answer"),
     ({"answerers": [None]}, "answerers: expected 1 whole numbers"),
@@ -417,6 +418,9 @@ BAD_ARGUMENTS = [
     ({"shown_first": [7]}, "shown_first: expected 1 whole numbers in -1 … 1"),
     ({"lapse_rate": 7}, "lapse_rate: expected a number"),
     ({"prior_scale": -1.0}, "prior_scale: expected a positive"),
+    ({"prior_scale": 1e-155}, "prior_scale: expected a number from 1e-30 to 1e[+]30, got 1e-155"),
+    ({"prior_scale": 1e155}, "prior_scale: expected a number from 1e-30 to 1e[+]30, got 1e[+]155"),
+    ({"tie_threshold": 1e20}, "tie_threshold: expected at most 1e[+]06 times prior_scale, 1, got 1e[+]20"),
 ]
 
 

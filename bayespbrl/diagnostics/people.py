@@ -22,10 +22,11 @@ def people(past: Sequence[PastQuestion], posterior: xr.DataTree | None = None) -
 
     Returns:
       `answers`, of which `ties`, and `cannot_tell`, which are no answers; `lapse_rate` and `side_bias`, posterior
-      means, with `…_lower` and `…_upper`, their 90 % intervals (the bias is positive towards the first shown, in
-      standard deviations of the margins; NaN where it is not inferred); `repeated`, how many of their answers were
-      asked for again from them and answered, and `consistent`, how many of these said the same, with
-      `consistency_lower` and `consistency_upper`, the exact 90 % interval of its share (Clopper and Pearson 1934);
+      means, with `…_lower` and `…_upper`, their 90 % intervals (the bias is positive towards the first shown, in the
+      unit of the margins, whose prior has the standard deviation `prior_scale`; NaN where it is not inferred);
+      `repeated`, how many of their answers were asked for again from them and answered, and `consistent`, how many of
+      these said the same, with `consistency_lower` and `consistency_upper`, the exact 90 % interval of its share
+      (Clopper and Pearson 1934);
       `shared`, how many of their questions somebody else answered too, and `agreed`, how many of these alike, with
       `agreement_lower` and `agreement_upper`;
       `seconds`, the median response time, NaN where none is known, with `seconds_lower` and `seconds_upper`, two order

@@ -61,7 +61,7 @@ def predictive_checks(tree: xr.DataTree, *, draws: int = 1000, seed: int = 0) ->
 
 def _row(observed: np.ndarray, simulated: np.ndarray, possible: int) -> tuple[float, ...]:
     p_value = np.mean(simulated > observed) + 0.5 * np.mean(simulated == observed)  # Gelman, Meng & Stern (1996)
-    lower, upper = np.quantile(simulated, (0.05, 0.95))
+    lower, upper = np.quantile(simulated, (0.05, 0.95), method="inverted_cdf")  # counts
     figures = (observed.mean(), simulated.mean(), lower, upper, possible, p_value if possible else np.nan)
     return tuple(float(figure) for figure in figures)
 

@@ -77,8 +77,10 @@ def calibration(
       predicted: probabilities that the first shown is preferred, shape (K,), as recorded during a run; they need
         `first_preferred`. None: by exact refits, K − 1 of them.
       groups: the number of the answer that each row follows from, shape (K,), never decreasing. The pair that was asked
-        about is the last row of its answer; only that row is scored. Every row is an answer of its own by default: not
-        so in a run with ties, after which one answer states several pairs. Its report scores each answer once.
+        about is the last row of its answer; only that row is scored. Every row is an answer of its own by default. Not
+        so in a learner's run with ties: after a tie one answer states several pairs, and its posterior has the ties
+        behind all pairs, so that each pair is predicted without them. Its report scores each answer once, by the
+        posterior that the learner had.
       seed: of drawn orders and of the curve's band.
       sampling_options: `num_samples` and the like of the refits.
 

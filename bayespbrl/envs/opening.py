@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import gymnasium
 import numpy as np
@@ -33,12 +32,12 @@ from bayespbrl.envs.spaces import bounded, from_plain, plain_space, to_plain
 OF_OBSERVATIONS = ("observation_period", "observation_names", "draw", "draw_trajectory", "pose", "grid_shape")
 OF_MAKE = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
 ONLY_LOOKING = (*OF_MAKE, RecordEpisodeStatistics, RecordVideo, RenderCollection, HumanRendering)  # change nothing seen
+MOST_NUMBERS = 1000  # of an observation: radial functions of it take 1 MB a number, and thrice that with more centres
 AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
 
-# Environments that we made from an id, and that can therefore be made again, N at a time.
-_MADE_FROM: WeakKeyDictionary[gymnasium.Env, EnvSpec] = WeakKeyDictionary()
-# What `flattened` wrapped.
-_GIVEN: WeakKeyDictionary[gymnasium.Env, gymnasium.Env] = WeakKeyDictionary()
+# Attributes of an environment object, which its copies have too: the spec from which we made it, so that it can be made
+# again, N at a time, and what `flattened` wrapped.
+_MADE_FROM, _GIVEN = "_bayespbrl_made_from", "_bayespbrl_given"
 
 
 def imported_by_name(environment: object) -> str:
@@ -74,7 +73,7 @@ def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
     if isinstance(environment, str | EnvSpec):
         spec = _spec(environment)
         opened = flattened(_make(spec))
-        _MADE_FROM[opened] = spec
+        vars(opened)[_MADE_FROM] = spec
         return opened
     if isinstance(environment, gymnasium.Env | FuncEnv) and type(environment).__hash__ is None:
         raise ValueError(
@@ -93,7 +92,7 @@ def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
 
 def made_from(env: gymnasium.Env) -> EnvSpec | None:
     """The spec from which `open_environment` made `env`; None for a user's object, of which there is only one."""
-    return _MADE_FROM.get(env)
+    return vars(env).get(_MADE_FROM)  # not getattr: a wrapper of the user's passes on what it wraps
 
 
 def environment_name(env: gymnasium.Env) -> str:
@@ -259,15 +258,22 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
         raise ValueError(
             f"environment {environment_name(env)}: expected a Discrete or real Box action space, got {actions}"
         )
-    if (plain := plain_space(observations, actions)) is not observations:
+    plain = plain_space(observations, actions)
+    if isinstance(plain, Box) and plain.shape[0] > MOST_NUMBERS:
+        raise ValueError(
+            f"environment {environment_name(env)}: expected observations of at most {MOST_NUMBERS} numbers, got "
+            f"{plain.shape[0]}; wrap it in one that observes less, as of a picture what is in it"
+        )
+    if plain is not observations:
         env = TransformObservation(env, lambda value: to_plain(observations, value, actions), plain)
     if (plain := bounded(plain_space(actions))) is not actions:
         env = TransformAction(env, lambda value: from_plain(actions, value), plain)
     if env is not given:
-        _GIVEN[env] = given
+        vars(env)[_GIVEN] = given
     return env
 
 
 def as_given(env: gymnasium.Env) -> gymnasium.Env:
     """The user's environment that `flattened` wrapped, with its own spaces; `env` itself where it wrapped nothing."""
-    return _GIVEN.get(env, env)
+    given: gymnasium.Env = vars(env).get(_GIVEN, env)
+    return given

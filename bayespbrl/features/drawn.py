@@ -113,13 +113,13 @@ class FeatureSource:
     ) -> StateFeatures:
         """φ(s), the user's in the units of the states of the trajectories, or drawn at these.
 
-        Where all are equally long and none ended by itself, there is no constant feature.
+        Where all are equally long and none ended by itself, no constant feature is drawn.
         """
-        alike = len({len(each) for each in trajectories}) == 1 and not any(each.terminated for each in trajectories)
+        equally_long = len({len(each) for each in trajectories}) == 1
         if self.own is not None:
             observed = _observed(trajectories)
             states = np.unique(observed) if observed.ndim == 1 else observed
-            return OwnFeatures.in_any_units(self.own, states, of_equal_lengths=alike)
+            return OwnFeatures.in_any_units(self.own, states, of_equal_lengths=equally_long)
         space = self.observation_space
         if options.diffusion and isinstance(space, Discrete):
             if space.n > MOST_CONNECTED:
@@ -127,7 +127,7 @@ class FeatureSource:
             return diffusion_basis(trajectories, int(space.n))
         if options.standardised and isinstance(space, Discrete):
             return standardised(trajectories, int(space.n))
-        if alike:
+        if equally_long and not any(each.terminated for each in trajectories):
             options = replace(options, constant=False)
         drawn = draw_state_features(self.observation_space, _observed(trajectories), self._periodic(options), rng=rng)
         if not (options.effort and isinstance(drawn, RadialBasis) and isinstance(self.action_space, Box)):

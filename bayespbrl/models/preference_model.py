@@ -15,6 +15,9 @@ from bayespbrl.models import priors
 from bayespbrl.models.likelihoods import LIKELIHOODS, Likelihood, Scalar, likelihood_of, log_prob
 from bayespbrl.models.priors import Grid
 
+# Beyond these, squares and densities are no numbers any more. Of a threshold so wide every answer is a tie.
+LEAST_SCALE, LARGEST_SCALE, WIDEST_TIE = 1e-30, 1e30, 1e6
+
 
 @dataclass(frozen=True)
 class PreferenceModel:
@@ -41,10 +44,16 @@ class PreferenceModel:
 
     def __post_init__(self) -> None:
         checks.positive("prior_scale", self.prior_scale)
+        checks.between("prior_scale", self.prior_scale, LEAST_SCALE, LARGEST_SCALE)
         checks.one_of("likelihood", self.likelihood, LIKELIHOODS)
         checks.optional(checks.positive, "steepness", self.steepness)
         checks.optional(checks.share, "lapse_rate", self.lapse_rate, below_one=True)
         checks.optional(checks.positive, "tie_threshold", self.tie_threshold)
+        if self.tie_threshold is not None and self.tie_threshold > WIDEST_TIE * self.prior_scale:
+            raise ValueError(
+                f"tie_threshold: expected at most {WIDEST_TIE:g} times prior_scale, {self.prior_scale:g}, got "
+                f"{self.tie_threshold!r}"
+            )
 
     @property
     def steepness_prior(self) -> Grid:

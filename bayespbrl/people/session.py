@@ -272,7 +272,7 @@ class Session:
         for seat in self.seats:
             if seat.introduction is not None and seat.introduction.clips is None:
                 seat.introduction.draw(self._clips, state)
-        said, likely = views.said_of(query, state)
+        said, likely = views.said_of(query, state, query.answerer if self._several else self.seats[0].answerer)
         return Shown(self._clips.of(query, state), said), likely
 
     def _described(self, seat: Seat, phase: str, state: LearnerState | None = None) -> dict[str, Any]:

@@ -64,21 +64,26 @@ def with_question(view: View, shown: Shown, rate: float) -> View:
     return {**view, "clips": [clip.described() for clip in shown.clips], "rate": rate, **shown.said}
 
 
-def said_of(query: Query, state: LearnerState) -> tuple[View, tuple[Answer, ...]]:
+def said_of(query: Query, state: LearnerState, answerer: str | None = None) -> tuple[View, tuple[Answer, ...]]:
     """What the learner says about a question, and the answers to it, the likeliest first.
 
-    A tie comes last while the run has none.
+    How sure it is of an answer counts the lapses and the side bias of who answers. What the answer is worth is what it
+    tells of the utility alone, as when questions are chosen. A tie comes last while the run has none.
     """
     said, likely = dict(NOTHING_SAID), UNKNOWN
     if state.estimate is not None and state.estimate.posterior is not None:
         draws = state.estimate.trajectory_draws(query.trajectories, number=queries.QUERY_DRAWS)
-        likelihood = state.estimate.likelihood(queries.QUERY_DRAWS)
-        margins = draws[:, :1] - draws[:, 1:]
-        first = float(prob(likelihood, margins).mean())
         thresholds = state.estimate.tie_thresholds(queries.QUERY_DRAWS)
         worth = queries.expected_information(
-            draws[:, :1], draws[:, 1:], likelihood=likelihood, tie_thresholds=thresholds
+            draws[:, :1],
+            draws[:, 1:],
+            likelihood=state.estimate.likelihood(queries.QUERY_DRAWS),
+            tie_thresholds=thresholds,
         )
+        likelihood = state.estimate.likelihood(queries.QUERY_DRAWS, answerer=answerer or "")
+        bias = state.estimate.side_biases(queries.QUERY_DRAWS, answerer=answerer or "")
+        margins = draws[:, :1] - draws[:, 1:] + (0.0 if bias is None else bias)
+        first = float(prob(likelihood, margins).mean())
         said |= {"sure": max(first, 1 - first), "worth": float(worth[0] / np.log(2))}
         if thresholds is not None:
             chances = chances_with_ties(margins, likelihood, thresholds)

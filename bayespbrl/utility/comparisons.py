@@ -49,7 +49,8 @@ class Comparisons:
           pairs, ties: of their numbers.
           discount: γ of ψ.
           sides: of the pairs and then the ties, as in `Source`; where there are any, a side bias is inferred.
-          answered_by: names, of the pairs and then the ties; each of several has a lapse rate and a side bias.
+          answered_by: names, of the pairs and then the ties; each person has a lapse rate and a side bias. Where nobody
+            has a name, all are one person.
         """
         every = (*pairs, *ties)
         numbers = sorted({number for pair in every for number in pair} or {0})
@@ -62,7 +63,7 @@ class Comparisons:
             Answers(
                 indifferent=tied if ties else None,
                 shown_first=None if sides is None or not any(sides) else np.array(sides),
-                answerers=None if answered_by is None or len(set(answered_by)) < 2 else np.array(answered_by),
+                answerers=np.array(answered_by) if answered_by is not None and any(answered_by) else None,
             ),
         )
 

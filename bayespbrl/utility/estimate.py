@@ -60,8 +60,12 @@ class UtilityEstimate(Protocol):
         """The utility wᵀψ(τ) of each trajectory."""
         ...
 
-    def likelihood(self, number: int | None = None) -> Likelihood:
+    def likelihood(self, number: int | None = None, *, answerer: str | None = None) -> Likelihood:
         """Likelihood of the next answer given its margin under each of S draws, about `number`; margins (S, n)."""
+        ...
+
+    def side_biases(self, number: int | None = None, *, answerer: str | None = None) -> Float[np.ndarray, "s 1"] | None:
+        """What each of these draws adds to the margin of the first shown; None where nothing is known."""
         ...
 
     def tie_thresholds(self, number: int | None = None) -> Float[np.ndarray, "s 1"] | None:
@@ -107,6 +111,7 @@ class WithoutDraws:
 
     posterior = None
     likelihood = refused("likelihood")
+    side_biases = refused("side_biases")
     tie_thresholds = refused("tie_thresholds")
     utilities_and_draws = refused("utilities_and_draws")
     mean_utilities = refused("mean_utilities")

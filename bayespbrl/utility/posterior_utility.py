@@ -58,17 +58,19 @@ class PosteriorUtility:
         few = drawn.isel(draw=slice(None, None, spacing(drawn["setting"].size, number))).load()
         return replace(self, posterior=DataTree.from_dict({"posterior": few}))
 
-    def likelihood(self, number: int | None = None) -> Likelihood:
+    def likelihood(self, number: int | None = None, *, answerer: str | None = None) -> Likelihood:
         """Likelihood of the next answer given its margin under each of S draws; margins have shape (S, n).
 
         Args:
           number: as in `trajectory_draws`.
+          answerer: whose it is, by a name that the posterior knows; any other's lapse rate is that of
+            `next_lapse_rates`.
         """
         drawn, fitted = self.posterior.children["posterior"].dataset, self.posterior.attrs
         apart = slice(None, None, self._apart(number))
-        steepness, lapse_rate = (
-            values[:, apart].reshape(-1, 1) for values in (drawn["steepness"].values, next_lapse_rates(self.posterior))
-        )
+        known = answerer in drawn.coords.get("answerer", ())
+        lapse_rates = drawn["lapse_rate"].sel(answerer=answerer).values if known else next_lapse_rates(self.posterior)
+        steepness, lapse_rate = (values[:, apart].reshape(-1, 1) for values in (drawn["steepness"].values, lapse_rates))
         return likelihood_of(
             fitted["likelihood"],
             float(number_of_preferences(self.posterior)),
@@ -82,6 +84,21 @@ class PosteriorUtility:
         if "tie_threshold" not in drawn:
             return None
         return np.asarray(drawn["tie_threshold"].values[:, :: self._apart(number)].reshape(-1, 1))
+
+    def side_biases(self, number: int | None = None, *, answerer: str | None = None) -> Float[np.ndarray, "s 1"] | None:
+        """What each of S draws adds to the margin of the first shown, as in `likelihood`; None where nothing is known.
+
+        Where the posterior knows answerers by name, nothing is known of any other.
+        """
+        drawn, apart = self.posterior.children["posterior"].dataset, self._apart(number)
+        if "side_bias" not in drawn:
+            return None
+        bias = drawn["side_bias"]
+        if "answerer" in bias.coords:
+            if answerer not in bias.coords["answerer"]:
+                return None
+            bias = bias.sel(answerer=answerer)
+        return np.asarray(bias[:, ::apart].values.reshape(-1, 1))
 
     def utilities(self, states: np.ndarray, *, actions: np.ndarray | None = None) -> Float[np.ndarray, " n"]:
         """The utility of n states, or with the actions that led there of n steps."""

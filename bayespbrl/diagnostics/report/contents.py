@@ -103,7 +103,7 @@ class RunContents:
     @property
     def scored(self) -> list[AnsweredQuestion]:
         """The answers that a posterior predicted: none without an order, and none of the first iteration."""
-        return [a for a in self.answers if a.iteration > 1 and a.row is not None and np.isfinite(a.predicted)]
+        return [a for a in self.answers if a.iteration > 1 and a.states_order and np.isfinite(a.predicted)]
 
     @property
     def without_posterior(self) -> bool:

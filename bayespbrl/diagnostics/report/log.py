@@ -9,16 +9,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from bayespbrl import events
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.events import Entry, LearnerState
 from bayespbrl.policies import Policy
-from bayespbrl.preferences import Answer
+from bayespbrl.preferences import Answer, Query
 from bayespbrl.runs.directory import PartialLine, read_log_lines, read_summary
 from bayespbrl.settings import Settings
 
 Summary = Mapping[str, Any]  # the figures of one iteration, as JSON has them
 Event = Mapping[str, Any]
+Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,10 @@ class AnsweredQuestion:
       iteration: in which it was answered, from 1; of several people, one may answer a question of an earlier iteration.
       first, second: numbers of the two trajectories in the order shown.
       answer: the expert's.
-      row: which of the K ordered pairs it is; None where it gave none (a tie, a skip).
+      row: which of the ordered pairs it is, or which of the ties; None of a skip.
       predicted: probability that the first is preferred, given that either is, by the estimate that the learner had
         when it was answered; NaN where that has no posterior or cannot be read.
-      stated: probability that either is, by the same.
+      stated: probability that either is, by the same; 1 before the first tie.
       answerer, seconds: who answered, and how long they took; None where that is not known.
     """
 
@@ -49,9 +52,16 @@ class AnsweredQuestion:
     seconds: float | None = None
 
     @property
+    def states_order(self) -> bool:
+        """Whether it says that one of the two is better."""
+        return self.answer in (Answer.FIRST, Answer.SECOND)
+
+    @property
     def before(self) -> float:
-        """The predicted probability of the answer that was given; NaN where it states no preference."""
-        if self.row is None:
+        """The predicted probability of the answer that was given; NaN of a skip, and of a tie before there was one."""
+        if self.answer is Answer.TIE and np.isfinite(self.predicted) and self.stated < 1:
+            return 1 - self.stated
+        if not self.states_order:
             return float("nan")
         return self.stated * (self.predicted if self.answer is Answer.FIRST else 1 - self.predicted)
 
@@ -119,7 +129,7 @@ def _applied(
     parts = {"trajectories": [None] * settings.rollouts.trajectories_per_iteration, "policy": None, "estimate": None}
     clips: list[tuple[int, int]] = []
     for event in log:
-        asked, pairs = {query.number: query for query in state.open}, len(state.preferences.pairs)
+        asked, before = {query.number: query for query in state.open}, state.preferences
         try:
             if event["event"] == "collected":
                 clips += events.clips_in(event)
@@ -129,12 +139,19 @@ def _applied(
             break
         if event["event"] == "answered":
             query = asked[event["query"]]
-            answer, new = Answer(event["answer"]), state.preferences.pairs[pairs:]
-            row = next((pairs + k for k, pair in enumerate(new) if {*pair} == {query.first, query.second}), None)
+            answer = Answer(event["answer"])
+            row = _row(before.ties, state.preferences.ties, query)
+            row = _row(before.pairs, state.preferences.pairs, query) if row is None else row
             who = {name: event[name] for name in ("answerer", "seconds") if name in event}
             shown = (query.first, query.second)
             answers.append(AnsweredQuestion(query.number, state.iteration + 1, *shown, answer, row, **who))
     return replace(state, clips=tuple(clips)), answers
+
+
+def _row(before: Pairs, after: Pairs, query: Query) -> int | None:
+    """The place of the two trajectories of a question among the pairs that its answer added."""
+    new = range(len(before), len(after))
+    return next((row for row in new if {*after[row]} == {query.first, query.second}), None)
 
 
 def _summaries(path: Path, state: LearnerState, damage: list[ReportWarning]) -> tuple[Summary, ...]:

@@ -114,8 +114,17 @@ def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
     if contents.without_posterior:
         return [contents.posterior_missing], []
     total = scores.sizes["prediction"]
+    blocks = _scores(scores, total) if total else list[Block]()
+    if contents.posterior is not None:
+        blocks.append(_predictive_checks(contents.posterior))
     if not total:
-        return ["No answer could be predicted before it was given."], []
+        return ["No answer that says which is better could be predicted before it was given."], blocks
+    few = ["The band is wide with so few answers: little can be concluded."] if total < FEW_ANSWERS else []
+    return few, blocks
+
+
+def _scores(scores: xr.Dataset, total: int) -> list[Block]:
+    """The scores of the predictions, beside what is expected of calibrated ones, and the reliability curve."""
     rows = []
     labels = ("log score (nats, summed)", "Brier score (mean)", "expected calibration error")
     for name, label in zip(("log_score", "brier_score", "expected_calibration_error"), labels, strict=True):
@@ -125,7 +134,10 @@ def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
         ["log score less its expectation, in standard deviations (z)", cell(float(scores["log_score_z"])), "0 ± 1"]
     )
     rows += [[name, number(float(scores[name])), ""] for name in ("miscalibration", "discrimination", "uncertainty")]
-    caption = "Each answer was predicted by the last posterior before it. 0 is the best score."
+    caption = (
+        "Each answer that says which is better was predicted by the last posterior before it, given that one is. 0 is "
+        "the best score."
+    )
     table = Table(caption, ["", "score", "expected if calibrated"], rows)
     curve = drawn(
         "calibration",
@@ -136,11 +148,7 @@ def calibration(contents: RunContents, scores: xr.Dataset) -> Body:
         f"Reliability curve of {total} predictions.",
         size=(5.6, 4.0),
     )
-    blocks: list[Block] = [curve, table]
-    if contents.posterior is not None:
-        blocks.append(_predictive_checks(contents.posterior))
-    few = ["The band is wide with so few answers: little can be concluded."] if total < FEW_ANSWERS else []
-    return few, blocks
+    return [curve, table]
 
 
 def _predictive_checks(tree: xr.DataTree) -> Table:
@@ -181,6 +189,7 @@ def updates(iterations: xr.Dataset) -> Body:
     blocks: list[Block] = [drawn("updates", panels, caption, "KL, temperature, entropy and effective samples.")]
     for group, label in (
         ("schedule", "Schedule of the KL bound"),
+        ("check", "The newest policy compared with the best before it; the bound is the schedule's times trust"),
         ("hyperparameters", "What was inferred besides the weights"),
     ):
         blocks += _reported(iterations, group, label)

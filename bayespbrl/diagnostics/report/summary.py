@@ -115,15 +115,19 @@ def _predictions(answers: xr.Dataset, scores: xr.Dataset) -> Iterator[str]:
     if before.size:
         with np.errstate(divide="ignore"):
             mean = np.exp(np.mean(np.log(before)))
+        tied = bool((answers["said"] == str(Answer.TIE)).any())
         yield (
             f"The answers since the first iteration had a probability of {percent(mean)} before they were given "
-            f"(geometric mean); {percent(np.mean(before > 0.5))} of them had more than one half. {_calibration(scores)}"
+            f"(geometric mean); {percent(np.mean(before > 0.5))} of them had more than one half. "
+            + _calibration(scores, "Of those that say which is better, the" if tied else "The")
         )
 
 
-def _calibration(scores: xr.Dataset) -> str:
+def _calibration(scores: xr.Dataset, the: str) -> str:
+    if not scores.sizes["prediction"]:
+        return "None of them says which is better."
     score, expected, sd = (float(scores[name]) for name in ("log_score", "log_score_expected", "log_score_sd"))
-    text = f"The log score is {number(score)} nats; {number(expected)} ± {number(sd)} is expected if calibrated: "
+    text = f"{the} log score is {number(score)} nats; {number(expected)} ± {number(sd)} is expected if calibrated: "
     if scores.sizes["prediction"] < ENOUGH_PREDICTIONS:
         return text + "too few answers to judge."
     if score < expected - 2 * sd:

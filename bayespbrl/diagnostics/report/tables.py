@@ -42,11 +42,12 @@ Variables = dict[str, tuple[str | tuple[str, ...], np.ndarray]]
 def iterations_table(summaries: Sequence[Summary]) -> xr.Dataset:
     """The figures of each completed iteration, as float64 along `iteration`; NaN where one is missing.
 
-    A list of numbers becomes its mean. What the schedule and the choice of hyperparameters reported becomes variables
-    `schedule …` and `hyperparameters …`, texts where they are no numbers.
+    A list of numbers becomes its mean. What the schedule, the check of the newest policy and the choice of
+    hyperparameters reported becomes variables `schedule …`, `check …` and `hyperparameters …`, texts where they are no
+    numbers.
     """
     columns: dict[str, list[Any]] = {name: [_number(summary.get(name)) for summary in summaries] for name in MEASURED}
-    for group in ("schedule", "hyperparameters"):
+    for group in ("schedule", "check", "hyperparameters"):
         rows = [_flat(summary.get(group)) for summary in summaries]
         for key in dict.fromkeys(key for row in rows for key in row):
             values = [row.get(key) for row in rows]
@@ -67,9 +68,10 @@ def answers_table(contents: RunContents) -> xr.Dataset:
 
     Returns:
       `question`, `iteration`, `first`, `second`, `said`, the answer; `before`, its probability by the estimate that the
-      learner had by then; `probability`, the same by the last posterior, which has seen the answer (NaN for a tie
-      or a skip, and for answers after the last estimate that can be read); `margin`, the utility of the preferred one
-      less that of the other by the last estimate, and its posterior standard deviation `margin_sd`.
+      learner had by then; `probability`, the same by the last posterior, which has seen the answer (NaN for a skip,
+      for a tie where ties are not used, and for answers after the last estimate that can be read); `margin`, the
+      utility of the preferred one less that of the other by the last estimate, and its posterior standard deviation
+      `margin_sd` (NaN for a tie).
     """
     answers = contents.answers
     data: Variables = {
@@ -98,12 +100,20 @@ def _by_last_estimate(
     NaN where these are unknown: without a posterior, or where a trajectory or its features are missing.
     """
     estimate, tree = contents.estimate, contents.posterior
-    if estimate is None or answer.row is None or answer.row >= estimate.quality.pairs:
+    if estimate is None or answer.row is None:
+        return np.nan, np.nan, np.nan
+    pairs = estimate.quality.pairs  # the rows of the ties come after them
+    row, rows = (
+        (answer.row, pairs) if answer.states_order else (pairs + answer.row, 0 if margins is None else margins.shape[2])
+    )
+    if row >= rows:
         return np.nan, np.nan, np.nan
     probability = spread = np.nan
     if tree is not None and margins is not None:
-        margin = margins[:, :, answer.row]
-        probability = float(np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, answer.row])))
+        margin = margins[:, :, row]
+        probability = float(np.mean(np.exp(np.asarray(tree["log_likelihood"]["answers"])[:, :, row])))
+        if not answer.states_order:
+            return probability, np.nan, np.nan
         spread = float(margin.std())
         if contents.settings.estimation.utility == "posterior-mean":  # the margin of the utility that is acted on
             return probability, float(margin.mean()), spread

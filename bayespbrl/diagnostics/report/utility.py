@@ -40,7 +40,7 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
         text += _remaining_uncertainty(table)
     compared = trajectories_table(contents)
     if compared.sizes["trajectory"] and np.ptp(compared["hidden_return"].values) > 0:
-        blocks.append(_trajectories(compared))
+        blocks.append(_trajectories(compared, clips=bool(contents.clips)))
     if ranking.sizes["trajectory"] > 1:
         caption = (
             "Probability of each rank of the newest trajectories and the newest undominated one; rank 1 is the best. A "
@@ -56,8 +56,9 @@ def _what_else(found: Mapping[str, Any], settings: int) -> str:
     """What the posterior says about all but the weights, in words; `settings` of length scales, and of effort."""
 
     def inferred(name: str) -> str:
-        low, high = (found[f"{name} {end}"] for end in ("lower", "upper"))
-        return f"{number(found[name])}" if low == high else f"{number(found[name])} ({number(low)} to {number(high)})"
+        low, mean, high = (found[f"{name}{end}"] for end in (" lower", "", " upper"))
+        set_to_it = np.allclose([low, high], mean)
+        return f"{number(mean)}" if set_to_it else f"{number(mean)} ({number(low)} to {number(high)})"
 
     text = f"Lapse rate: {inferred('lapse_rate')}, steepness: {inferred('steepness')}"
     effort = "weight of the effort of actions, in prior standard deviations"
@@ -85,18 +86,22 @@ def _remaining_uncertainty(table: xr.Dataset) -> list[str]:
     left = table["sd"].values[inside] / table["prior_sd"].values[inside]
     return [
         f"The posterior standard deviation is {percent(np.median(left))} of the prior's in the median over the states "
-        f"shown, and {percent(left.min())} where most was learnt. Answers distinguish whole trajectories, and say less "
-        "about single states."
+        f"shown, and {percent(left.min())} where most was learnt. Answers distinguish what was shown as a whole, and "
+        "say less about single states."
     ]
 
 
-def _trajectories(compared: xr.Dataset) -> Picture:
+def _trajectories(compared: xr.Dataset, *, clips: bool) -> Picture:
     caption = (
         "Every trajectory that a question showed. A rising cloud means that the utility orders the trajectories as the "
         "hidden return does. The scale is arbitrary."
     )
+    if clips:
+        caption += " Both are of the clip that was shown."
     if "lower" in compared:
-        caption += " The intervals are the posterior's, for the utility of the whole trajectory."
+        caption += (
+            f" The intervals are the posterior's, for the utility of the whole {'clip' if clips else 'trajectory'}."
+        )
     alt = f"Inferred utility against hidden return of {compared.sizes['trajectory']} trajectories."
     panels = [("Trajectories", partial(figures.plot_trajectories, compared))]
     return drawn("trajectories", panels, caption, alt, size=(6.0, 3.3))
