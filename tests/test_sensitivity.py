@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from arviz_stats import psense, psense_summary
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import norm
@@ -9,6 +10,7 @@ from bayespbrl import infer_utility
 from bayespbrl.diagnostics import plot_sensitivity, sensitivity
 from bayespbrl.diagnostics.power_scaling import _quantities
 from bayespbrl.models import sample_posterior
+from bayespbrl.models.posterior_tree import restored, stored
 
 SAMPLING = {"num_warmup": 100, "num_samples": 400, "max_samples": 400}
 DIFFERENCES = np.array([[0.9, -0.4, 0.0], [0.5, 0.8, 0.0], [0.0, 0.0, 0.0]])
@@ -49,6 +51,15 @@ def test_the_posterior_of_an_estimate_takes_features_too():
     utility = infer_utility(np.eye(3), [(0, 1), (1, 2)], steepness=5.0, lapse_rate=0.0)
     of_items = sensitivity(utility.posterior, np.eye(3) / utility.scales)
     assert of_items.sizes["quantity"] == 3
+
+
+def test_arviz_says_the_same_of_the_posterior_as_it_is(tree):
+    ours = sensitivity(tree)["sensitivity"].values[:, :2]
+    moving = {"var_names": ["margins"], "coords": {"preference": [0, 1]}}  # the third is constant
+    for group, of_margins in zip(("prior", "likelihood"), ours, strict=True):
+        np.testing.assert_allclose(psense(tree, group=group, **moving)["margins"].values, of_margins)
+    table = psense_summary(restored(stored(tree)), **moving)
+    np.testing.assert_allclose(table["prior"], ours[0], atol=1e-3)
 
 
 def test_features_have_no_side():

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from bayespbrl import checks
 from bayespbrl.diagnostics.axes import finished
 from bayespbrl.models.low_rank import low_rank
-from bayespbrl.models.posterior_tree import bases_of, check_posterior, settings_of
+from bayespbrl.models.posterior_tree import bases_of, check_posterior, log_prior, settings_of
 
 COMPONENTS = ("prior", "likelihood")
 # Least standard deviation of a log density over the draws, in nats. Below it powers near 1 have no visible effect, and
@@ -42,13 +42,13 @@ def sensitivity(tree: xr.DataTree, features: np.ndarray | None = None, *, seed: 
     Source: Kallioinen et al. (2024), by `arviz_stats.psense`.
     """
     check_posterior(tree)
-    draws, log_prior = _quantities(tree, features, seed=seed)
+    draws, of_prior = _quantities(tree, features, seed=seed)
     labels = {"chain": np.arange(draws.shape[0]), "draw": np.arange(draws.shape[1])}
     varies = ~np.all(draws == draws[:1, :1], axis=(0, 1))
     log_likelihood = np.asarray(tree["log_likelihood"]["answers"]).sum(axis=2)
     sensitivities = np.zeros((2, draws.shape[2]))
     groups = {"posterior": (("chain", "draw", "quantity"), draws[:, :, varies])}
-    for row, (name, log_density) in enumerate(zip(COMPONENTS, (log_prior, log_likelihood), strict=True)):
+    for row, (name, log_density) in enumerate(zip(COMPONENTS, (of_prior, log_likelihood), strict=True)):
         if not varies.any() or np.std(log_density) < LEAST_SPREAD:
             continue
         group = {f"log_{name}": (("chain", "draw"), log_density)}
@@ -78,9 +78,9 @@ def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) ->
     """Draws (chain, draw, n), and the log prior (chain, draw) of the coordinates they depend on, up to a constant."""
     z = np.asarray(tree["posterior"]["coordinates"])
     scale = float(tree.attrs["prior_scale"])
-    log_prior = -np.sum(z**2, axis=2) / (2 * scale**2)  # eq. 7
+    of_coordinates = log_prior(z, scale)
     if features is None:
-        return np.asarray(tree["posterior"]["margins"]), log_prior
+        return np.asarray(tree["posterior"]["margins"]), of_coordinates
     settings = settings_of(np.asarray(tree["constant_data"]["differences"]))
     if len(settings) > 1:
         raise ValueError(
@@ -96,8 +96,7 @@ def _quantities(tree: xr.DataTree, features: np.ndarray | None, *, seed: int) ->
     rounding = np.linalg.norm(rest, axis=1) <= 1e-9 * np.linalg.norm(features, axis=1)
     outside = low_rank(np.where(rounding[:, None], 0.0, rest))
     unseen = scale * np.random.default_rng(seed).standard_normal((*z.shape[:2], outside.loadings.shape[1]))
-    log_prior = log_prior - np.sum(unseen**2, axis=2) / (2 * scale**2)  # eq. 7
-    return z @ inside.T + unseen @ outside.loadings.T, log_prior
+    return z @ inside.T + unseen @ outside.loadings.T, of_coordinates + log_prior(unseen, scale)
 
 
 def _diagnosis(sensitive: np.ndarray) -> np.ndarray:

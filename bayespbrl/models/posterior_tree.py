@@ -183,13 +183,16 @@ def _factors_of(tree: xr.DataTree) -> list[LowRank]:
 def stored(tree: xr.DataTree) -> xr.DataTree:
     """The tree without what `restored` computes, to write to disk."""
     posterior = tree.children["posterior"].to_dataset(inherit=False)
-    return _replaced(
-        tree, posterior.drop_vars(["utility_weights", "side_bias"], errors="ignore"), xr.Dataset(attrs=tree.attrs)
-    )
+    posterior = posterior.drop_vars(["utility_weights", "side_bias"], errors="ignore")
+    without = xr.DataTree.from_dict({name: node for name, node in tree.children.items() if name != "log_prior"})
+    return _replaced(without, posterior, xr.Dataset(attrs=tree.attrs))
 
 
 def restored(tree: xr.DataTree) -> xr.DataTree:
-    """The tree with `posterior["utility_weights"]`, computed where it is indexed, the side bias, and points for all."""
+    """The tree with `posterior["utility_weights"]`, computed where it is indexed, the side bias, and points for all.
+
+    And with the log prior.
+    """
     factors = _factors_of(tree)
     return _with_weights(_in_these_coordinates(tree, factors), [each.basis for each in factors])
 
@@ -239,9 +242,15 @@ def _with_weights(tree: xr.DataTree, bases: Sequence[Float[np.ndarray, "d _"]]) 
             # paper, step 1: the posterior mean μ_w, or the most likely sample
             parts[number] = (basis @ (share[chosen] @ z[chosen][:, : basis.shape[1]]))[:width]
         points[f"utility_weights_{name}"] = (("setting", "feature"), parts) if several else (("feature",), parts[0])
-    return _replaced(tree, posterior, xr.Dataset(points, attrs=tree.attrs))
+    prior = xr.Dataset({"coordinates": (SAMPLE, log_prior(z, scale))}, {name: posterior[name] for name in SAMPLE})
+    return _replaced(tree, posterior, xr.Dataset(points, attrs=tree.attrs), log_prior=prior)
 
 
-def _replaced(tree: xr.DataTree, posterior: xr.Dataset, root: xr.Dataset) -> xr.DataTree:
+def log_prior(z: Float[np.ndarray, "chain draw q"], prior_scale: float) -> Float[np.ndarray, "chain draw"]:
+    """Log prior of the coordinates, up to a constant (eq. 7)."""
+    return np.asarray(-np.sum(z**2, axis=2) / (2 * prior_scale**2))
+
+
+def _replaced(tree: xr.DataTree, posterior: xr.Dataset, root: xr.Dataset, **others: xr.Dataset) -> xr.DataTree:
     groups = {path: node.to_dataset(inherit=False) for path, node in tree.subtree_with_keys}
-    return xr.DataTree.from_dict({**groups, ".": root, "posterior": posterior})
+    return xr.DataTree.from_dict({**groups, **others, ".": root, "posterior": posterior})
