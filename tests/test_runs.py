@@ -132,6 +132,19 @@ def test_what_is_loaded_is_what_was_learned(finished, straight):
     assert run.estimate.utilities(np.arange(25)).shape == (25,)
 
 
+def test_the_estimate_of_every_iteration_can_be_read(finished, tmp_path):
+    run = bayespbrl.load(finished)
+    for number, summary in enumerate(run.iterations, 1):
+        assert run.estimate_of(number).quality.pairs == summary["pairs"]
+    np.testing.assert_array_equal(run.estimate_of(3).weights, run.estimate.weights)
+    for bad in (0, 4):
+        with pytest.raises(ValueError, match="iteration: expected"):
+            run.estimate_of(bad)
+    (Path(shutil.copytree(finished, tmp_path / "copy")) / "iterations" / "0001.nc").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"0001\.nc: expected the netCDF file of an iteration"):
+        bayespbrl.runs.run.Run(tmp_path / "copy", run.learner).estimate_of(1)
+
+
 def test_loading_changes_nothing(finished):
     before = contents(finished)
     run = bayespbrl.load(finished)

@@ -23,6 +23,7 @@ from bayespbrl.preferences import Preferences
 from bayespbrl.queries import QueryRule, highest_utility
 from bayespbrl.runs.answers_file import write_answers
 from bayespbrl.runs.directory import RunDirectory
+from bayespbrl.runs.iteration_files import read_parts
 from bayespbrl.runs.stored_classes import classes_of, from_tree, to_tree
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
@@ -231,6 +232,17 @@ class Run:
     def posterior(self) -> xr.DataTree | None:
         """Posterior draws of the last fit in ArviZ's schema; None where the estimate is no posterior."""
         return None if self.estimate is None else self.estimate.posterior
+
+    def estimate_of(self, iteration: int) -> UtilityEstimate:
+        """The utility estimate of a completed iteration, from 1 as in `iterations`, read from its file.
+
+        Raises:
+          ValueError: no number of a completed iteration; a file that cannot be read.
+        """
+        number = checks.whole("iteration", iteration, most=len(self.iterations))
+        file, features = RunDirectory.open(self.path).iteration_file(number), self.learner.cycle.feature_source.own
+        estimate: UtilityEstimate = read_parts(file, ["estimate"], features=features)["estimate"]
+        return estimate
 
     def estimate_without(self, answerer: str | None) -> UtilityEstimate:
         """The utility inferred without one person's answers; the run is not changed. None is who gave no name.
