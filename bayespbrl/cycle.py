@@ -127,6 +127,11 @@ class Cycle(Collection):
             options = replace(options, answers=options.answers - self.settings.confirmations)
         return questions.later_questions(self.query_rule, given, options, state.preferences, unasked=state.unasked)
 
+    def _duels(self, state: LearnerState) -> bool:
+        """Whether the last two trajectories of the iteration are of two policies that are compared without noise."""
+        compared = self.settings.questions.against_kept and self.settings.rollouts.noise_free
+        return compared and state.iteration > state.started and self._favourite(state) > 0
+
     def _nominated(self, state: LearnerState) -> bool:
         """Whether the restarted policy is to be asked about now: it may be better than the kept one.
 
@@ -156,7 +161,7 @@ class Cycle(Collection):
             shown = {"first": again.second, "second": again.first, "newcomer": again.newcomer}
             return _entry({"event": "asked", "query": number, **shown, "repeats": again.number, **who})
         preferences = state.preferences
-        duel = options.against_kept and state.opponents.get(newcomer) == newcomer - 1 == len(state.trajectories) - 2
+        duel = self._duels(state) and state.opponents.get(newcomer) == newcomer - 1 == len(state.trajectories) - 2
         given = state.opponents if options.same_start or duel else {}
         incumbent = given[newcomer] if duel else opponent_now(newcomer, given, state.trajectories, preferences)
         query = queries.show(number, newcomer, incumbent, state.compared, rng=self._rng(SHOW, number))

@@ -96,7 +96,7 @@ class QuerySituation:
         numbers = [self.noise_free, opponent, *sorted(self.shown)]
         draws = self.estimate.trajectory_draws([self.trajectories[n] for n in numbers], number=QUERY_DRAWS)
         worth = draws[:, :2].max(axis=1).mean() - draws[:, :2].mean(axis=0).max()
-        return (self.noise_free,) if worth >= STAKE * draws[:, 2:].std(axis=1).mean() else ()
+        return (self.noise_free,) if worth > 0 and worth >= STAKE * draws[:, 2:].std(axis=1).mean() else ()
 
     def told_by(self, number: int) -> float:
         """What the answer to the question about one trajectory is expected to tell, in nats."""
@@ -149,8 +149,7 @@ def information(situation: QuerySituation) -> list[int]:
 def disagreement(situation: QuerySituation) -> list[int]:
     """The comparison that the draws disagree on most first: the variance of which is better."""
     utilities, opponents = situation.draws()
-    better = probability_better(utilities, opponents)
-    return _ordered(situation, utilities, better * (1 - better))
+    return _ordered(situation, utilities, np.sign(utilities - opponents).var(axis=0))
 
 
 def eubo(situation: QuerySituation) -> list[int]:

@@ -224,6 +224,18 @@ def test_a_restarted_run_that_was_stopped_or_undone_goes_on_bit_for_bit(restarte
     assert finished.state.kept.number == restarted.learner.state.kept.number
 
 
+def test_what_shares_a_start_by_chance_is_no_comparison_of_policies():
+    """The last two of the first iteration start alike, but both are of one policy with its noise."""
+    options = FAST | {"answers": 4, "worthwhile": False, "trajectories_per_iteration": 4, "same_start": True}
+    learner, expert, asked = Learner(Slope(), **options), ReturnExpert(), []
+    while query := learner.ask():
+        asked.append((query[0].newcomer, query[0].incumbent, query[0].duel, learner.state.best.number))
+        learner.tell([expert(*query[0].trajectories)])
+    assert (3, 2) in {both[:2] for both in asked} | {both[1::-1] for both in asked}
+    assert not any(duel for *_, duel, best in asked if not best)
+    assert all(len(learner.trajectories) > newcomer == opponent + 1 for newcomer, opponent, duel, _ in asked if duel)
+
+
 @pytest.mark.parametrize("seed", [8, 11])
 def test_policies_are_compared_without_noise_and_a_restarted_one_before_it_is_kept(seed):
     sizes = FAST | {"answers": 10, "restart_iterations": 8, "worthwhile": False, "seed": seed}

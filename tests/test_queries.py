@@ -119,6 +119,8 @@ def test_rules_order_the_same_draws_each_in_its_way():
     assert order("probably-better", DRAWS, ZERO) == (1, 2, 0)
     # variances of the order 3/16, 3/16, 1/4: the even match first, then the equal ones by their mean
     assert order("disagreement", DRAWS, ZERO) == (2, 0, 1)
+    # on what is equal in every draw they all agree
+    assert order("disagreement", np.column_stack([ZERO, DRAWS]), ZERO)[-1] == 0
     # the mean of the better of the two: 9/4, 3/4, 4/4
     assert order("eubo", DRAWS, ZERO) == (0, 2, 1)
     # a logistic answer at ±1 is a vague one; at ±2 and evenly split it tells most
@@ -366,6 +368,7 @@ def test_a_policy_without_its_noise_is_asked_about_while_the_posterior_doubts_it
         (3.0, 0.02, ()),  # 0.06, below a fiftieth of 5
         (3.0, 1.0, ()),  # its opponent is better for sure
         (0.1, 0.5, ()),  # nobody knows which of the two is better, and it hardly matters
+        (0.0, 0.5, ()),
     ],
 )
 def test_a_policy_without_noise_is_asked_about_where_it_matters_which_of_the_two_is_kept(margin, chance, expected):

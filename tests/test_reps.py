@@ -32,6 +32,39 @@ def test_the_bound_and_the_state_distribution_are_met(problem, kl_bound):
     assert solution.feature_gap < 1e-7
 
 
+@pytest.mark.parametrize("problem", [random_problem, continuous_problem])
+@pytest.mark.parametrize("size", [1e3, 1e6])
+def test_what_differs_between_states_alone_hides_no_advantage(problem, size):
+    """V(s) that is linear in the features is the same for all admissible p, however large it is."""
+    q_values, features, base = problem()
+    mapping = whitened(features, base).mapping  # what the constraint does not keep is no function of its features
+    of_states = mapping @ (size * np.random.default_rng(2).normal(size=mapping.shape[1]))
+    plain = reps_weights(q_values, features, base, kl_bound=0.2)
+    hidden = reps_weights(q_values + features @ of_states, features, base, kl_bound=0.2)
+    assert hidden.bound_active
+    np.testing.assert_allclose(hidden.probabilities, plain.probabilities, atol=1e-5)
+    assert np.ptp(features @ (hidden.value_weights - plain.value_weights - of_states)) < 0.01
+
+
+def test_where_q_differs_between_states_alone_there_is_nothing_to_gain():
+    _, features, base = random_problem()
+    solution = reps_weights(features @ np.arange(6.0), features, base, kl_bound=0.2)
+    np.testing.assert_allclose(solution.sample_weights, 1.0)
+    assert solution.kl == pytest.approx(0.0, abs=1e-15)
+    assert solution.status == reps.CONSTANT
+    assert np.ptp(features @ solution.value_weights - features @ np.arange(6.0)) < 1e-9
+
+
+def test_columns_that_are_zero_everywhere_change_nothing():
+    _, features, base = random_problem()
+    wide = np.zeros((len(features), 1500))
+    wide[:, 7:1500:250] = features
+    few, many = whitened(features, base), whitened(wide, base)
+    np.testing.assert_allclose(np.abs(many.features), np.abs(few.features), atol=1e-9)
+    np.testing.assert_allclose((wide - base @ wide) @ many.mapping, many.features, atol=1e-12)
+    assert np.count_nonzero(many.mapping.any(axis=1)) == 6
+
+
 def test_weights_equal_the_primal_optimum_of_a_general_solver():
     q_values, features, base = random_problem(states=3, actions=2, seed=5)
     solution = reps_weights(q_values, features, base, kl_bound=0.05)

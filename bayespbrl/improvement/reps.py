@@ -16,6 +16,9 @@ from bayespbrl import checks
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
 TEMPERATURE_CEILING = 1e9  # KL is 1e-18 there, less than its rounding
 HIGHER_FLOORS = (1e-2, 1e-1)  # where the solver does not finish near the floor
+# Least spread of the advantages, as a share of that of Q; where it is less, the floor would end every step too early.
+LEAST_ADVANTAGE = 5e-3
+MANY_FEATURES = 1000  # from here on, columns that are zero everywhere, as of states never seen, are left out first
 RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
 CONSTANT = "constant Q: nothing to gain"
@@ -91,6 +94,11 @@ def whitened(
       ValueError: entries that are not finite.
     """
     checks.finite("state_features", state_features)
+    if state_features.shape[1] > MANY_FEATURES and 0 < np.sum(used := np.any(state_features, axis=0)) < len(used):
+        few = whitened(state_features[:, used], base_weights, most=most)
+        mapping = np.zeros((len(used), few.mapping.shape[1]))
+        mapping[used] = few.mapping
+        return WhitenedFeatures(few.features, mapping)
     centred = state_features - base_weights @ state_features  # φ − φ̂ of eq. 11
     covariance = centred.T @ (centred * base_weights[:, None])
     values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
@@ -134,14 +142,10 @@ def reps_weights(
         raise ValueError(f"state_features: expected shape (N, D), got {phi.shape}")
     constraint = whitened(phi, base) if constraint is None else constraint
     features = constraint.features
-    mean = base @ q
-    spread = np.sqrt(base @ (q - mean) ** 2)
-    # what LSTD's penalties leave of a constant Q is noise, and must not be blown up to the size of the bound
-    scale, temperature, converged, status = 1.0, 1.0, True, CONSTANT
+    scaled, scale, known = _standardised(q, features, base)
+    temperature, converged, status = 1.0, True, CONSTANT
     standardised, dual = np.zeros_like(q), np.zeros(features.shape[1])  # the weights that change nothing
-    if spread > 1e-8 * np.abs(mean):
-        scale = spread
-        scaled = (q - mean) / scale
+    if scaled.any():
         reached, multipliers, converged, status = _solve_dual(scaled, features, base, kl_bound)
         if converged:  # what an unfinished solver leaves is no update: stay where we are, and say so
             temperature, dual, standardised = reached, multipliers, scaled
@@ -152,7 +156,7 @@ def reps_weights(
     return RepsSolution(
         sample_weights=probabilities / base,  # eq. 14; mean Σ W·p/W = 1 by construction
         probabilities=probabilities,
-        value_weights=scale * (constraint.mapping @ dual),  # eq. 12: V(s) = vᵀφ(s) + constant
+        value_weights=constraint.mapping @ (known + scale * dual),  # eq. 12: V(s) = vᵀφ(s) + constant
         temperature=scale * temperature,
         kl=float(probabilities[positive] @ np.log((probabilities / base)[positive])),  # eq. 11
         kl_bound=kl_bound,
@@ -162,6 +166,31 @@ def reps_weights(
         converged=converged,
         status=status,
     )
+
+
+def _standardised(
+    q_values: PerSample, features: Float[np.ndarray, "n r"], base_weights: PerSample
+) -> tuple[PerSample, float, Float[np.ndarray, " r"]]:
+    """Q centred and divided by its spread, that spread, and the weights of a part of V(s) that was taken off before.
+
+    It is taken off where Q differs far more between states than between actions: under the constraint it is the same
+    for all p, and beside it nothing else would be seen. All is zero, and the scale 1, where only rounding is left:
+    what LSTD's penalties leave of a constant Q is noise, and must not be blown up to the size of the bound.
+    """
+    none = np.zeros(features.shape[1])
+    mean = base_weights @ q_values
+    centred = q_values - mean
+    spread = float(np.sqrt(base_weights @ centred**2))
+    if not spread > 1e-8 * np.abs(mean):
+        return np.zeros_like(q_values), 1.0, none
+    of_states = features.T @ (base_weights * centred)
+    advantage = centred - features @ of_states
+    gain = float(np.sqrt(base_weights @ advantage**2))
+    if gain >= LEAST_ADVANTAGE * spread:
+        return centred / spread, spread, none
+    if not gain > 1e-8 * np.max(np.abs(q_values)):
+        return np.zeros_like(q_values), 1.0, of_states
+    return advantage / gain, gain, of_states
 
 
 def reps_weights_by_state(

@@ -29,6 +29,7 @@ from bayespbrl.policies.policy import ContinuousPolicy, DiscretePolicy, fit_conv
 
 NEARLY = 0.8  # of the bound; a further update would take most policies beyond it
 NOTHING = 1e-3  # of the bound, or of a nat where it is larger; weights that have moved by less have nothing to gain
+LEAST_MOVE = 1e-6  # nats, below any bound of a schedule of ours; a fit to samples alone moves a policy by far more
 MOST_CONSTRAINED = 0.25  # features of the constraint on the state distribution, of the samples
 
 
@@ -241,7 +242,7 @@ def apply_update(
         if number:
             proposed = propose(improved, proposed.problem, key=jax.random.fold_in(key, number))
         reps = proposed.solve(kl_bound)
-        if reps.kl < NOTHING * min(kl_bound, 1.0) or not reps.converged:
+        if reps.kl < max(NOTHING * min(kl_bound, 1.0), LEAST_MOVE) or not reps.converged:
             break
         fit = getattr(improved, "fit_mean" if number and hasattr(type(improved), "fit_mean") else "fit")
         improved = fit(*proposed.samples, reps.sample_weights, rng=rng, base_weights=proposed.base_weights)  # eq. 14
