@@ -41,8 +41,7 @@ def run_directories(study: Path) -> list[Path]:
 def predictions(study: Path) -> tuple[np.ndarray, np.ndarray, int]:
     """Probability that the first shown is preferred, whether it was, for all answers of a study; number of runs."""
     runs = run_directories(study)
-    asked = [answer for run in runs for answer in read_contents(run).answers]
-    decided = [a for a in asked if a.iteration > 1 and a.row is not None and np.isfinite(a.predicted)]
+    decided = [answer for run in runs for answer in read_contents(run).scored]
     predicted = np.array([answer.predicted for answer in decided])
     return predicted, np.array([answer.answer is Answer.FIRST for answer in decided], dtype=bool), len(runs)
 

@@ -459,11 +459,11 @@ def test_an_observation_of_too_many_numbers_is_refused():
 
 
 @dataclass
-class ByValue(gymnasium.Env):
+class ByValue(FuncEnv):
     size: int = 3
 
 
-def test_an_environment_that_compares_by_value_is_named():
+def test_functions_that_compare_by_value_are_named():
     with pytest.raises(ValueError, match="environment ByValue: expected a class with a hash"):
         open_environment(ByValue())
 

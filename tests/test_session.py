@@ -112,7 +112,7 @@ def test_an_environment_that_goes_by_its_earlier_episodes_has_none_but_those_of_
 def test_a_tie_is_foreseen_last_until_the_run_has_one():
     learner = bayespbrl.Learner("gridworld", expert="other", **QUICK)
     answers = tuple(map(Answer, ("second", "first", "skip", "tie")))
-    foresight = Foresight(learner.cycle, learner.state, lambda state, query: ("shown", answers))
+    foresight = Foresight(learner.cycle, learner.state, lambda state, query, who: ("shown", answers))
 
     def foreseen(number):
         """The answers after which the next moments are foreseen."""

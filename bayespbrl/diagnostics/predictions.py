@@ -53,7 +53,8 @@ def answer_probabilities(tree: xr.DataTree, differences: np.ndarray, answers: An
       differences: ψ(one) − ψ(other) of n comparisons, in the units of the fitted differences, shape (n, D), or
         (C, n, D) where the fitted ones have settings.
       answers: who answers, of those known to the tree, and which side the one is shown on. Without a side there is no
-        side bias; without an answerer the lapse rate is that of `next_lapse_rates`.
+        side bias; without an answerer the lapse rate is that of `next_lapse_rates`, and where the tree knows names
+        there is no side bias either.
 
     Returns:
       shape (n, 3): the one is preferred, the other is preferred, no difference (0 where nothing was tied).

@@ -68,14 +68,14 @@ def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
 
     Raises:
       ValueError: unknown name; an environment that cannot be made; an action space that is neither a real `Box` nor
-        `Discrete`, or an observation space that gymnasium does not flatten.
+        `Discrete`, or an observation space that gymnasium does not flatten, or to more than 1000 numbers.
     """
     if isinstance(environment, str | EnvSpec):
         spec = _spec(environment)
         opened = flattened(_make(spec))
         vars(opened)[_MADE_FROM] = spec
         return opened
-    if isinstance(environment, gymnasium.Env | FuncEnv) and type(environment).__hash__ is None:
+    if isinstance(environment, FuncEnv) and type(environment).__hash__ is None:
         raise ValueError(
             f"environment {type(environment).__name__}: expected a class with a hash, got one that compares by value; "
             "@dataclass(eq=False) does not"
@@ -262,7 +262,7 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
     if isinstance(plain, Box) and plain.shape[0] > MOST_NUMBERS:
         raise ValueError(
             f"environment {environment_name(env)}: expected observations of at most {MOST_NUMBERS} numbers, got "
-            f"{plain.shape[0]}; wrap it in one that observes less, as of a picture what is in it"
+            f"{plain.shape[0]}; wrap it so that it observes less, for example positions in place of a picture"
         )
     if plain is not observations:
         env = TransformObservation(env, lambda value: to_plain(observations, value, actions), plain)

@@ -101,8 +101,9 @@ def sample_posterior(
         side_bias (chain, draw) where `shown_first` is known, with a dimension answerer where `answerers` are; and
         utility_weights (chain, draw, feature), those of the draw's setting; the last two are computed when indexed;
       `sample_stats`: lp (log likelihood), candidates (per move), stuck, diverging (a likelihood of zero or NaN);
-      `log_likelihood`: answers (chain, draw, preference); `log_prior`: coordinates (chain, draw), as ArviZ's `psense`
-        takes it for the prior scale; `observed_data`: answers, 1 as given and 0 for a tie;
+      `log_likelihood`: answers (chain, draw, preference); `log_prior`: coordinates (chain, draw), the log density
+        of z alone, up to a constant, by which ArviZ's `psense` weighs other prior scales; `observed_data`: answers, 1
+        as given and 0 for a tie;
       `constant_data`: differences, with a dimension `setting` in front where they had one; shown_first, answerers;
       at the root: utility_weights_mean (feature), whose part outside the differences' row space is exactly zero;
         utility_weights_most_likely (feature), the draw of highest likelihood with the rest at its mean, zero (both with

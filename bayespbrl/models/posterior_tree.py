@@ -189,10 +189,7 @@ def stored(tree: xr.DataTree) -> xr.DataTree:
 
 
 def restored(tree: xr.DataTree) -> xr.DataTree:
-    """The tree with `posterior["utility_weights"]`, computed where it is indexed, the side bias, and points for all.
-
-    And with the log prior.
-    """
+    """The tree with `posterior["utility_weights"]`, computed where it is indexed, side bias, log prior and points."""
     factors = _factors_of(tree)
     return _with_weights(_in_these_coordinates(tree, factors), [each.basis for each in factors])
 

@@ -69,7 +69,7 @@ class Foresight:
 
     Args:
       cycle: of the learner.
-      show: what is shown of a question in a state, and the answers to it, the likeliest first.
+      show: what is shown of a question in a state to a person, and the answers to it, the likeliest first.
       people: who are here; (None,) is one person without a name. Each gets a question of their own.
       several: whether there may be others than these.
       most: answers of the run after which the sitting is over.
@@ -79,7 +79,7 @@ class Foresight:
         self,
         cycle: Cycle,
         state: LearnerState,
-        show: Callable[[LearnerState, Query], tuple[Shown, tuple[Answer, ...]]],
+        show: Callable[[LearnerState, Query, str | None], tuple[Shown, tuple[Answer, ...]]],
         people: Sequence[str | None] = (None,),
         *,
         several: bool = False,
@@ -101,7 +101,7 @@ class Foresight:
         Changes nothing: answers may come meanwhile.
         """
         if (query := moment.unseen) is not None:
-            return Drawn(query.number, *self.show(moment.state, query))
+            return Drawn(query.number, *self.show(moment.state, query, moment.holders[query.number]))
         return self._next(moment)
 
     def _next(self, moment: Moment) -> Entry | None:
@@ -173,7 +173,8 @@ class Foresight:
     def _following(self, moment: Moment, state: LearnerState, holders: Mapping[int, str | None]) -> Moment:
         """A moment with that state, and with what is known of the questions of `moment` that are still open."""
         still = self._holders(state, holders)
-        return Moment(state, still, drawn={number: moment.drawn[number] for number in still if number in moment.drawn})
+        same = (number for number in moment.drawn if (number, still.get(number)) in moment.holders.items())
+        return Moment(state, still, drawn={number: moment.drawn[number] for number in same if number in still})
 
     def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
         """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.

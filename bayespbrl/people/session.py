@@ -267,12 +267,12 @@ class Session:
 
     # What is shown.
 
-    def _show(self, state: LearnerState, query: Query) -> tuple[Shown, tuple[Answer, ...]]:
+    def _show(self, state: LearnerState, query: Query, who: str | None) -> tuple[Shown, tuple[Answer, ...]]:
         """What a person is shown of a question that waits, and the answers to it, the likeliest first."""
         for seat in self.seats:
             if seat.introduction is not None and seat.introduction.clips is None:
                 seat.introduction.draw(self._clips, state)
-        said, likely = views.said_of(query, state, query.answerer if self._several else self.seats[0].answerer)
+        said, likely = views.said_of(query, state, who)
         return Shown(self._clips.of(query, state), said), likely
 
     def _described(self, seat: Seat, phase: str, state: LearnerState | None = None) -> dict[str, Any]:

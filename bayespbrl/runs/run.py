@@ -239,6 +239,8 @@ class Run:
         Raises:
           ValueError: no number of a completed iteration; a file that cannot be read.
         """
+        if not self.iterations:
+            raise ValueError(f"iteration: expected a run with a completed iteration, got {self.path} without")
         number = checks.whole("iteration", iteration, most=len(self.iterations))
         file, features = RunDirectory.open(self.path).iteration_file(number), self.learner.cycle.feature_source.own
         estimate: UtilityEstimate = read_parts(file, ["estimate"], features=features)["estimate"]

@@ -102,7 +102,7 @@ def _rows(table: xr.Dataset, order: np.ndarray) -> Table:
     rows = [[cell(table[name].values[k]) for name in names] for k in order]
     caption = (
         "Every answer: its probability before it was given and given all answers, and its margin, the utility of the "
-        "preferred trajectory less that of the other. The first tie has no probability beforehand: from then on they "
-        "are expected."
+        "preferred trajectory less that of the other. A tie has no probability beforehand until an estimate has seen "
+        "one."
     )
     return Table(caption, head, rows)

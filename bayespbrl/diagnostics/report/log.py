@@ -36,7 +36,7 @@ class AnsweredQuestion:
       row: which of the ordered pairs it is, or which of the ties; None of a skip.
       predicted: probability that the first is preferred, given that either is, by the estimate that the learner had
         when it was answered; NaN where that has no posterior or cannot be read.
-      stated: probability that either is, by the same; 1 before the first tie.
+      stated: probability that either is, by the same; 1 if it has seen no tie.
       answerer, seconds: who answered, and how long they took; None where that is not known.
     """
 
@@ -58,7 +58,7 @@ class AnsweredQuestion:
 
     @property
     def before(self) -> float:
-        """The predicted probability of the answer that was given; NaN of a skip, and of a tie before there was one."""
+        """The predicted probability of the answer that was given; NaN of a skip, or a tie that is the first it sees."""
         if self.answer is Answer.TIE and np.isfinite(self.predicted) and self.stated < 1:
             return 1 - self.stated
         if not self.states_order:

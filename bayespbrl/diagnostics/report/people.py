@@ -33,8 +33,9 @@ def people_section(contents: RunContents) -> Body:
     rows = [_row(table.isel(answerer=place), given=given, shared=shared) for place in range(table.sizes["answerer"])]
     caption = (
         "Everyone who answered, with 90 % intervals. Lapse rate: the share of answers given at random. Side bias: "
-        "how much better the trajectory shown first looks, in standard deviations of the utility differences. Same on "
-        "repeats: how many repeated questions were answered as before, with the exact interval of the share. "
+        "how much better the trajectory shown first looks; before any answer, differences in utility have a standard "
+        f"deviation of {contents.model.prior_scale:g}. Same on repeats: how many repeated questions were answered as "
+        "before, with the exact interval of the share. "
         f"{'Same as others: how many questions that somebody else answered too were answered alike. ' * shared}"
         "Median time: the interval holds the median of all their answers, by order statistics; from five times on."
     )

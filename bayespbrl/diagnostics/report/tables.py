@@ -49,6 +49,9 @@ def iterations_table(summaries: Sequence[Summary]) -> xr.Dataset:
     columns: dict[str, list[Any]] = {name: [_number(summary.get(name)) for summary in summaries] for name in MEASURED}
     for group in ("schedule", "check", "hyperparameters"):
         rows = [_flat(summary.get(group)) for summary in summaries]
+        for row in rows:
+            if row.get("standard_error") == 0:  # no policy was compared
+                row |= {"gain": None, "standard_error": None}
         for key in dict.fromkeys(key for row in rows for key in row):
             values = [row.get(key) for row in rows]
             convert = _text if any(isinstance(value, str) for value in values) else _number

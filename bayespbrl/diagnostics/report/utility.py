@@ -57,8 +57,8 @@ def _what_else(found: Mapping[str, Any], settings: int) -> str:
 
     def inferred(name: str) -> str:
         low, mean, high = (found[f"{name}{end}"] for end in (" lower", "", " upper"))
-        set_to_it = np.allclose([low, high], mean)
-        return f"{number(mean)}" if set_to_it else f"{number(mean)} ({number(low)} to {number(high)})"
+        given = np.allclose([low, high], mean, atol=0)
+        return f"{number(mean)}" if given else f"{number(mean)} ({number(low)} to {number(high)})"
 
     text = f"Lapse rate: {inferred('lapse_rate')}, steepness: {inferred('steepness')}"
     effort = "weight of the effort of actions, in prior standard deviations"
