@@ -46,8 +46,6 @@ TOLERANCE = 1e-5  # relative: the data have six digits
 EXACT_ITERATIONS, ROUNDED = 2, 1e-3
 # Seconds, as committed, of the iterations that are run again; the rest of a trial that took longer is not.
 LONGEST = 200.0
-# Run before chains start apart where answers contradict each other: its trials with a posterior come out otherwise.
-CHAINS_OTHERWISE = ("paper",)
 
 
 def committed() -> dict[str, StudyData]:
@@ -121,12 +119,11 @@ def write_figures(studies: dict[str, StudyData]) -> None:
 def cheapest(data: StudyData) -> RowData | None:
     """The row whose trials take the least time, of what the study is about; None where none learns.
 
-    That is a baseline where it has one, else a method with a posterior, but one without of `CHAINS_OTHERWISE`.
+    That is a baseline where it has one, else a method with a posterior.
     """
     learned = [row for row in data.rows if not row.declared.untrained]
-    plain = data.name in CHAINS_OTHERWISE
     chosen = [row for row in learned if row.declared.baseline is not None] or [
-        row for row in learned if (row.declared.options.get("utility") in WITHOUT_POSTERIOR) == plain
+        row for row in learned if row.declared.options.get("utility") not in WITHOUT_POSTERIOR
     ]
     return min(chosen or learned, key=lambda row: float(row.lines["seconds"].sum() / len(row.seeds)), default=None)
 

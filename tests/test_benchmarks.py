@@ -167,8 +167,7 @@ def test_the_cell_that_is_run_again_is_of_what_a_study_is_about():
     page = benchmark("results_page")
     rows = {name: page.cheapest(data).declared for name, data in page.committed().items()}
     assert {name for name, row in rows.items() if row.baseline} == {"pf", "epmc"}
-    without = {name for name, row in rows.items() if row.options.get("utility") in ("known-reward", "linear-program")}
-    assert without == set(page.CHAINS_OTHERWISE)
+    assert not [name for name, row in rows.items() if row.options.get("utility") in ("known-reward", "linear-program")]
 
 
 @pytest.mark.slow
