@@ -231,9 +231,9 @@ def test_expected_information_lies_between_nothing_and_one_bit(likelihood):
 
 
 def test_information_prefers_what_the_posterior_is_unsure_of_over_what_the_expert_is():
-    # The first newcomer equals the incumbent in every draw: its answer is a toss, even so all draws agree on that. The
-    # second is far better or far worse: its answer tells which.
-    utilities = np.column_stack([np.zeros(100), np.repeat([-3.0, 3.0], 50)])
+    # The first newcomer nearly equals the incumbent in every draw: its answer is a toss, and all draws agree on that.
+    # The second is far better or far worse: its answer tells which.
+    utilities = np.column_stack([np.tile([-0.01, 0.01], 50), np.repeat([-3.0, 3.0], 50)])
     for rule in ("information", "disagreement"):
         found = order(rule, utilities + 1.0, np.ones(100), likelihood=Logistic(5.0))
         assert found == ((1, 0) if rule == "information" else (0, 1))  # to the order alone both are even matches

@@ -16,8 +16,7 @@ from bayespbrl import checks
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
 TEMPERATURE_CEILING = 1e9  # KL is 1e-18 there, less than its rounding
 HIGHER_FLOORS = (1e-2, 1e-1)  # where the solver does not finish near the floor
-# Least spread of the advantages, as a share of that of Q; where it is less, the floor would end every step too early.
-LEAST_ADVANTAGE = 5e-3
+LEAST_ADVANTAGE = 5e-3  # spread of the advantages over that of Q; with less, the floor would end each step too early
 MANY_FEATURES = 1000  # from here on, columns that are zero everywhere, as of states never seen, are left out first
 RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
@@ -173,24 +172,19 @@ def _standardised(
 ) -> tuple[PerSample, float, Float[np.ndarray, " r"]]:
     """Q centred and divided by its spread, that spread, and the weights of a part of V(s) that was taken off before.
 
-    It is taken off where Q differs far more between states than between actions: under the constraint it is the same
-    for all p, and beside it nothing else would be seen. All is zero, and the scale 1, where only rounding is left:
-    what LSTD's penalties leave of a constant Q is noise, and must not be blown up to the size of the bound.
+    It is taken off where Q differs far more between states than between actions: it is the same for all admissible p,
+    and beside it nothing else would be seen. All is zero where only rounding is left: what LSTD's penalties leave of a
+    constant Q is noise, and must not be blown up to the size of the bound.
     """
-    none = np.zeros(features.shape[1])
-    mean = base_weights @ q_values
-    centred = q_values - mean
-    spread = float(np.sqrt(base_weights @ centred**2))
-    if not spread > 1e-8 * np.abs(mean):
-        return np.zeros_like(q_values), 1.0, none
+    centred = q_values - (mean := base_weights @ q_values)
     of_states = features.T @ (base_weights * centred)
     advantage = centred - features @ of_states
-    gain = float(np.sqrt(base_weights @ advantage**2))
-    if gain >= LEAST_ADVANTAGE * spread:
-        return centred / spread, spread, none
-    if not gain > 1e-8 * np.max(np.abs(q_values)):
-        return np.zeros_like(q_values), 1.0, of_states
-    return advantage / gain, gain, of_states
+    spread, gain = (float(np.sqrt(base_weights @ each**2)) for each in (centred, advantage))
+    if spread > 1e-8 * np.abs(mean) and gain >= LEAST_ADVANTAGE * spread:
+        return centred / spread, spread, np.zeros_like(of_states)
+    if gain > 1e-8 * np.max(np.abs(q_values)):
+        return advantage / gain, gain, of_states
+    return np.zeros_like(q_values), 1.0, of_states
 
 
 def reps_weights_by_state(
