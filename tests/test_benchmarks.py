@@ -405,3 +405,13 @@ def test_kept_policies_are_compared_with_the_best_by_other_episodes(printed, tmp
     assert row["seemed best"] == pytest.approx(max(each["value_newest"] for each in run.iterations), abs=1e-4)
     assert row["value best"] > row["value first"]
     assert any(line.startswith("fresh episodes: close in") for line in lines)
+
+
+@pytest.mark.slow
+def test_an_answer_that_states_no_order_is_not_scored(tmp_path):
+    said = iter(["first", "first", "tie", "second"])
+    options = QUICK | {"utility": "posterior-mean", "iterations": 3}
+    bayespbrl.start("gridworld", tmp_path / "run", **options).run(lambda first, second: next(said))
+    predicted, first_preferred, runs = benchmark("calibration").predictions(tmp_path)
+    assert (predicted.shape, first_preferred.tolist(), runs) == ((1,), [False], 1)
+    assert 0 < predicted[0] < 1
