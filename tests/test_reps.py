@@ -5,7 +5,8 @@ import pytest
 import scipy.optimize
 
 from bayespbrl.improvement import reps
-from bayespbrl.improvement.reps import advantages, reps_weights, reps_weights_by_state, whitened
+from bayespbrl.improvement.reps import advantages, reps_weights, reps_weights_by_state
+from bayespbrl.improvement.whitening import whitened
 
 
 def random_problem(states=6, actions=3, seed=0):

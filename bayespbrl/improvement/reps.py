@@ -12,16 +12,14 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from bayespbrl import checks
+from bayespbrl.improvement.whitening import PerSample, WhitenedFeatures, regressed, whitened
 
 TEMPERATURE_FLOOR = 1e-3  # in standard deviations of Q; a bound that asks for less is not active
 TEMPERATURE_CEILING = 1e9  # KL is 1e-18 there, less than its rounding
 HIGHER_FLOORS = (1e-2, 1e-1)  # where the solver does not finish near the floor
 LEAST_ADVANTAGE = 5e-3  # spread of the advantages over that of Q; with less, the floor would end each step too early
-MANY_FEATURES = 1000  # from here on, columns that are zero everywhere, as of states never seen, are left out first
-RANK_TOLERANCE = 1e-3  # share of the largest singular value
 ITERATIONS = 500  # cap of the solver; some twenty are usual
 CONSTANT = "constant Q: nothing to gain"
-PerSample = Float[np.ndarray, " n"]  # one number per sample
 
 
 @dataclass(frozen=True)
@@ -63,51 +61,6 @@ class RepsSolution:
     def effective_samples(self) -> float:
         """The effective sample size 1/Σ pᵢ² (Kish 1965)."""
         return float(1 / np.sum(self.probabilities**2))
-
-
-@dataclass(frozen=True)
-class WhitenedFeatures:
-    """Features of the constraint, centred and of unit variance under W. They do not depend on the bound.
-
-    Attributes:
-      features: those that are kept.
-      mapping: from the centred features as given to these.
-    """
-
-    features: Float[np.ndarray, "n r"]
-    mapping: Float[np.ndarray, "d r"]
-
-
-def whitened(
-    state_features: Float[np.ndarray, "n d"], base_weights: PerSample, *, most: int | None = None
-) -> WhitenedFeatures:
-    """Features whitened under W, without directions below `RANK_TOLERANCE` of the largest singular value.
-
-    None are kept where only rounding tells the samples apart.
-
-    Args:
-      state_features, base_weights: as in `reps_weights`.
-      most: of the directions that are kept, those of the largest singular values; None: all.
-
-    Raises:
-      ValueError: entries that are not finite.
-    """
-    checks.finite("state_features", state_features)
-    if state_features.shape[1] > MANY_FEATURES and 0 < np.sum(used := np.any(state_features, axis=0)) < len(used):
-        few = whitened(state_features[:, used], base_weights, most=most)
-        mapping = np.zeros((len(used), few.mapping.shape[1]))
-        mapping[used] = few.mapping
-        return WhitenedFeatures(few.features, mapping)
-    centred = state_features - base_weights @ state_features  # φ − φ̂ of eq. 11
-    covariance = centred.T @ (centred * base_weights[:, None])
-    values, vectors = np.linalg.eigh(covariance)  # D × D, not the N × D singular values
-    keep = values > max(values[-1], 0.0) * RANK_TOLERANCE**2
-    rounding = (1e-12 * np.max(np.abs(state_features), initial=0.0)) ** 2
-    if not np.any(keep) or values[-1] <= rounding:
-        return WhitenedFeatures(np.zeros((len(centred), 0)), np.zeros((centred.shape[1], 0)))
-    leading = slice(None if most is None else -most, None)  # the eigenvalues ascend
-    mapping = (vectors[:, keep] / np.sqrt(values[keep]))[:, leading]
-    return WhitenedFeatures(centred @ mapping, mapping)
 
 
 def reps_weights(
@@ -176,11 +129,9 @@ def _standardised(
     and beside it nothing else would be seen. All is zero where only rounding is left: what LSTD's penalties leave of a
     constant Q is noise, and must not be blown up to the size of the bound.
     """
-    centred = q_values - (mean := base_weights @ q_values)
-    of_states = features.T @ (base_weights * centred)
-    advantage = centred - features @ of_states
+    centred, of_states, advantage = regressed(q_values, features, base_weights)
     spread, gain = (float(np.sqrt(base_weights @ each**2)) for each in (centred, advantage))
-    if spread > 1e-8 * np.abs(mean) and gain >= LEAST_ADVANTAGE * spread:
+    if spread > 1e-8 * np.abs(base_weights @ q_values) and gain >= LEAST_ADVANTAGE * spread:
         return centred / spread, spread, np.zeros_like(of_states)
     if gain > 1e-8 * np.max(np.abs(q_values)):
         return advantage / gain, gain, of_states
@@ -285,8 +236,7 @@ def advantages(
       base_weights: Wᵢ.
     """
     if isinstance(constraint, WhitenedFeatures):
-        centred = q_values - base_weights @ q_values
-        advantage = centred - constraint.features @ (constraint.features.T @ (base_weights * centred))
+        *_, advantage = regressed(q_values, constraint.features, base_weights)
     else:
         visits = np.bincount(constraint, weights=base_weights)
         advantage = q_values - (np.bincount(constraint, weights=base_weights * q_values) / visits)[constraint]

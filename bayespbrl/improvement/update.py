@@ -16,14 +16,8 @@ from jaxtyping import Float, Int, Key, Shaped
 from bayespbrl import checks
 from bayespbrl.improvement.problem import UpdateProblem
 from bayespbrl.improvement.q_function import CriticData, QFunction, estimate_q
-from bayespbrl.improvement.reps import (
-    RepsSolution,
-    WhitenedFeatures,
-    advantages,
-    reps_weights,
-    reps_weights_by_state,
-    whitened,
-)
+from bayespbrl.improvement.reps import RepsSolution, advantages, reps_weights, reps_weights_by_state
+from bayespbrl.improvement.whitening import WhitenedFeatures, whitened
 from bayespbrl.policies import Policy, clipped, entropies, is_discrete, sample_actions
 from bayespbrl.policies.policy import ContinuousPolicy, DiscretePolicy, fit_converged
 

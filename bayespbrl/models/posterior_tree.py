@@ -184,8 +184,8 @@ def stored(tree: xr.DataTree) -> xr.DataTree:
     """The tree without what `restored` computes, to write to disk."""
     posterior = tree.children["posterior"].to_dataset(inherit=False)
     posterior = posterior.drop_vars(["utility_weights", "side_bias"], errors="ignore")
-    without = xr.DataTree.from_dict({name: node for name, node in tree.children.items() if name != "log_prior"})
-    return _replaced(without, posterior, xr.Dataset(attrs=tree.attrs))
+    kept = tree.filter(lambda node: node.name != "log_prior")
+    return _replaced(kept, posterior, xr.Dataset(attrs=tree.attrs))
 
 
 def restored(tree: xr.DataTree) -> xr.DataTree:

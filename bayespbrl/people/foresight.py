@@ -173,8 +173,8 @@ class Foresight:
     def _following(self, moment: Moment, state: LearnerState, holders: Mapping[int, str | None]) -> Moment:
         """A moment with that state, and with what is known of the questions of `moment` that are still open."""
         still = self._holders(state, holders)
-        same = (number for number in moment.drawn if (number, still.get(number)) in moment.holders.items())
-        return Moment(state, still, drawn={number: moment.drawn[number] for number in same if number in still})
+        same = [number for number, _ in still.items() & moment.holders.items() if number in moment.drawn]
+        return Moment(state, still, drawn={number: moment.drawn[number] for number in same})
 
     def _holders(self, state: LearnerState, before: Mapping[int, str | None]) -> dict[int, str | None]:
         """Who looks at which open question: whoever did before, then who was asked, then anybody who has none.

@@ -58,7 +58,7 @@ class AnsweredQuestion:
 
     @property
     def before(self) -> float:
-        """The predicted probability of the answer that was given; NaN of a skip, or a tie that is the first it sees."""
+        """The predicted probability of the answer that was given; NaN of a skip, or of a tie before `stated` < 1."""
         if self.answer is Answer.TIE and np.isfinite(self.predicted) and self.stated < 1:
             return 1 - self.stated
         if not self.states_order:

@@ -50,7 +50,7 @@ def iterations_table(summaries: Sequence[Summary]) -> xr.Dataset:
     for group in ("schedule", "check", "hyperparameters"):
         rows = [_flat(summary.get(group)) for summary in summaries]
         for row in rows:
-            if row.get("standard_error") == 0:  # no policy was compared
+            if row.get("gain") == row.get("standard_error") == 0:  # no policy was compared
                 row |= {"gain": None, "standard_error": None}
         for key in dict.fromkeys(key for row in rows for key in row):
             values = [row.get(key) for row in rows]
