@@ -97,6 +97,10 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.actions)
 
+    def at(self, rows: Shaped[np.ndarray, " m"]) -> "Transitions":
+        """These rows of the table, by index or as a mask."""
+        return Transitions(*(column[rows] for column in vars(self).values()))
+
 
 def transitions(trajectories: Sequence[Trajectory]) -> Transitions:
     """The steps of `trajectories` as one table."""

@@ -607,6 +607,41 @@ def test_copies_of_an_environment_run_side_by_side(environment):
     assert len({trajectory.states[0, 1] for trajectory in trajectories}) == 4  # each its own seed
 
 
+class Draws(gymnasium.Env):
+    """Ends by chance, and counts the steps and resets of all its copies."""
+
+    observation_space, action_space = Box(0, 1, (1,), np.float64), Discrete(2)
+    steps, resets = 0, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        Draws.resets += 1
+        return self.np_random.uniform(size=1), {}
+
+    def step(self, action):
+        Draws.steps += 1
+        drawn = self.np_random.uniform(size=1)
+        return drawn, float(drawn[0]), bool(drawn[0] < 0.2), False, {}
+
+
+def test_a_copy_whose_episode_has_ended_is_not_stepped_while_the_others_go_on():
+    gymnasium.register("bayespbrl-tests/Draws-v0", entry_point=Draws, max_episode_steps=15)
+    try:
+        trajectories = rollout("bayespbrl-tests/Draws-v0", Coin(np.array(0.5)), key=KEY, episodes=128)
+        assert Draws.resets == 128
+        assert Draws.steps == sum(len(trajectory) for trajectory in trajectories) < 0.6 * 128 * 15
+        assert max(len(trajectory) for trajectory in trajectories) == 15
+        more = rollout("bayespbrl-tests/Draws-v0", Coin(np.array(0.5)), key=KEY, episodes=130)  # the copies begin anew
+    finally:
+        del gymnasium.registry["bayespbrl-tests/Draws-v0"]
+    alone = Draws()
+    for number, trajectory in enumerate(more):
+        first, _ = alone.reset(seed=rollouts.reset_seed(KEY) + number)
+        steps = [alone.step(0) for _ in range(len(trajectory))]
+        np.testing.assert_array_equal(trajectory.states, [first, *(step[0] for step in steps)])
+        assert trajectory.terminated == steps[-1][2]
+
+
 def test_a_single_object_runs_episode_by_episode_and_stays_open():
     class Closing(Plain):
         def close(self):

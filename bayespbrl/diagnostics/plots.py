@@ -14,9 +14,11 @@ from bayespbrl.diagnostics.axes import finished, number_cells
 from bayespbrl.diagnostics.estimates import expect_estimate
 from bayespbrl.envs.opening import environment_attribute
 from bayespbrl.envs.stepping import of_whole_episodes
-from bayespbrl.figures import new_figure
+from bayespbrl.figures import new_figure, spread
 from bayespbrl.learner import Learner
 from bayespbrl.trajectories import Transitions, transitions
+
+MOST_STEPS = 5000  # drawn as points: more of them hide each other
 
 
 def learning_curve(iterations: Sequence[Mapping[str, Any]], axes: Axes, *, optimum: float | None = None) -> Axes:
@@ -84,11 +86,14 @@ def utility_beside_reward(learner: Learner, utility_axes: Axes, reward_axes: Axe
     """The inferred utility and the hidden reward of the visited states.
 
     Maps for a grid, coloured points for two-dimensional observations. For all other observations: the utility of each
-    step against its reward, and of each trajectory against its return.
+    step against its reward, and of each trajectory against its return. Points are of at most `MOST_STEPS` steps, evenly
+    spread.
     """
-    steps = transitions(learner.trajectories)
-    utilities = expect_estimate(learner.estimate).step_utilities(steps)
     shape = environment_attribute(learner.environment, "grid_shape")
+    steps = transitions(learner.trajectories)
+    if shape is None:
+        steps = steps.at(spread(len(steps), MOST_STEPS))
+    utilities = expect_estimate(learner.estimate).step_utilities(steps)
     if shape is None and (steps.states.ndim != 2 or steps.states.shape[1] != 2):
         return _scatter(utilities, steps.rewards, learner, utility_axes, reward_axes)
     draw = _points if shape is None else partial(_map_of_cells, shape=shape)

@@ -130,24 +130,37 @@ def random_episodes(env: gymnasium.Env, most: int, hold: int = 1, *, time_limit:
 
 
 class _Silent(gymnasium.Wrapper):
-    """Without infos: nobody reads them, and copies side by side fail where theirs are of different form."""
+    """One episode after each reset with a seed, without infos.
 
-    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-        """The observation alone."""
-        returned = self.env.reset(**arguments)
+    Nobody reads infos, and copies side by side fail where theirs are of different form. A copy whose episode has ended
+    waits for the others: where it returns its last observation, nothing is stepped.
+    """
+
+    _last: Any = None  # observation of an episode that has ended
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """The observation alone; without a seed, as copies reset themselves after an episode, its last one."""
+        if seed is None and self._last is not None:
+            return self._last, {}
+        self._last = None
+        returned = self.env.reset(seed=seed, options=options)
         if not isinstance(returned, tuple) or len(returned) != 2:
             raise ValueError(f"expected (observation, info), got {shortened(returned)}")
         return self._observed(returned[0]), {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """A step without its info; NumPy would make NaN of a reward that is None."""
+        if self._last is not None:
+            return self._last, 0.0, False, False, {}
         returned = self.env.step(action)
         if not isinstance(returned, tuple) or len(returned) != 5:
             raise ValueError(f"expected (observation, reward, terminated, truncated, info), got {shortened(returned)}")
         observation, reward, terminated, truncated, _ = returned
         if reward is None or np.asarray(reward).ndim:
             raise ValueError(f"expected a number as the reward, got {reward!r}")
-        return self._observed(observation), reward, terminated, truncated, {}
+        self._observed(observation)
+        self._last = observation if terminated or truncated else None
+        return observation, reward, terminated, truncated, {}
 
     def _observed(self, observation: Any) -> Any:
         if np.shape(observation) != self.observation_space.shape:
@@ -205,7 +218,7 @@ def _batch(
 ) -> list[Episode]:
     """One episode a lane, from episode `first` on; `env` is the one that `vector` copies.
 
-    A lane that has ended goes on with the others (it resets itself) and is ignored.
+    A lane that has ended is ignored: a copy waits, and in a vector version of the environment's own it goes on.
     """
     lanes, seen, done = vector.num_envs, vector.single_observation_space, vector.single_action_space
     name = environment_name(env)

@@ -143,8 +143,7 @@ def _sums(
     rows: Int[np.ndarray, " r"],
 ) -> TransitionSums:
     """LSTD's sums over some of the transitions."""
-    chosen = Transitions(*(column[rows] for column in vars(data.steps).values()))
-    chosen, utilities, counts = _counted(chosen, data.utilities[rows])
+    chosen, utilities, counts = _counted(data.steps.at(rows), data.utilities[rows])
     following = None if following is None else following[rows]
 
     def sums(rows: slice) -> TransitionSums:
@@ -177,7 +176,7 @@ def _counted(
     columns = utilities.reshape(len(utilities), -1).T
     sums = [np.bincount(inverse.ravel(), weights=column) for column in columns]
     means = (np.stack(sums) / counts).T.reshape(-1, *utilities.shape[1:])
-    return Transitions(*(column[first] for column in vars(steps).values())), means, counts.astype(float)
+    return steps.at(first), means, counts.astype(float)
 
 
 def _expected_features(
