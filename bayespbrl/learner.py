@@ -183,8 +183,8 @@ class Learner:
     def ask(self, *, answerer: str | None = None) -> list[Query]:
         """The question that waits for an answer, after doing whatever comes before it; empty when finished.
 
-        Each new trajectory is compared with the best of all before it, so there is one question at a time. Where
-        several people answered at once, all questions that they left wait, as far as the budget goes. With `answerer`,
+        There is one at a time: each answer may decide what the next trajectory is compared with. Where several
+        people answered at once, all questions that they left wait, as far as the budget goes. With `answerer`,
         the name of who answers next, it is one that they may answer: another person's repeated question stays open.
         """
         if answerer is not None:

@@ -149,7 +149,7 @@ def _facts(contents: RunContents) -> list[tuple[str, str]]:
         ("lapse rate λ", "inferred" if model.lapse_rate is None else f"{model.lapse_rate:g}"),
         ("KL bound ε", f"{settings.update.kl_bound:g}"),
         ("most updates per iteration", str(settings.update.updates_per_iteration)),
-        ("most iterations in a row without a question", str(settings.questions.unasked_iterations)),
+        ("most iterations in a row without a question, when sure", str(settings.questions.unasked_iterations)),
         ("discount γ of Q", f"{settings.critic.discount:g}"),
         ("discount γ of ψ", f"{settings.trajectory_discount:g}"),
         ("policy", settings.rollouts.policy),
