@@ -93,8 +93,8 @@ RUN_OPTIONS = {
     "clip_steps": "Steps of the random part of each trajectory that a question shows; all of it if omitted.",
     "same_start": "Compare two trajectories from the same start, where resets of the environment by seed allow it.",
     "unasked_iterations": "How many iterations in a row ask nothing while the posterior is sure, with the schedule "
-    "confidence (at most half the answers so far); more follow where no question is worth an answer. 0 in the paper and "
-    "for people.",
+    "confidence (at most half the answers so far); more follow where no question is worth an answer. 0 in the paper "
+    "and for people.",
     "likelihood": f"Likelihood of an answer: {', '.join(LIKELIHOODS)}. The default, mixed, is eq. 8.",
     "prior_scale": "Prior standard deviation of each utility weight.",
     "steepness": "Steepness of the likelihood, for feature differences of root mean square length 1; inferred if "
