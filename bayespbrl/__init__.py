@@ -5,6 +5,7 @@ from bayespbrl.learner import Learner
 from bayespbrl.preferences import Answer, Preferences, Query
 from bayespbrl.runs.answers_file import read_answers, read_questions
 from bayespbrl.runs.run import Run, load, resume, start
+from bayespbrl.runs.simulated import expert_of
 from bayespbrl.runs.utility_reward import UtilityReward
 from bayespbrl.settings import Settings
 from bayespbrl.trajectories import Trajectory
@@ -22,6 +23,7 @@ __all__ = [
     "TerminalExpert",
     "Trajectory",
     "UtilityReward",
+    "expert_of",
     "infer_utility",
     "load",
     "read_answers",

@@ -53,6 +53,7 @@ class Cycle(Collection):
         steps, options = self.settings.questions.clip_steps, self.settings.rollouts
         if steps is not None and steps > (limit := step_limit(self.environment, options.max_steps)):
             raise ValueError(f"clip_steps: expected at most {limit}, the steps of an episode, got {steps}")
+        self.feature_source.check(self.settings.features.of_utility)
 
     @one_blas_thread()
     def next(self, state: LearnerState, answerer: str | None = None, *, others: int | None = None) -> Entry | None:

@@ -14,12 +14,12 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, On
 from gymnasium.utils.env_checker import check_env
 from matplotlib.figure import Figure
 from PIL import Image
-from toys import Odd, Push
+from toys import QUICK, Odd, Push
 
 import bayespbrl
 from bayespbrl import envs
 from bayespbrl.envs import functional
-from bayespbrl.envs.opening import open_environment
+from bayespbrl.envs.opening import environment_attribute, open_environment
 from bayespbrl.envs.pictures import draw_trajectory, film, frames
 from bayespbrl.envs.spaces import to_plain
 from bayespbrl.policies import LinearGaussianPolicy, SoftmaxPolicy
@@ -361,3 +361,38 @@ def test_a_module_beside_the_user_that_is_not_found_is_given_a_hint(monkeypatch,
         open_environment("mazes_of_mine:Maze-v0")
     with pytest.raises(ValueError, match=r"No module named 'nowhere_else'\)"):
         open_environment("nowhere_else:Maze-v0")
+
+
+class Scaled(gymnasium.ActionWrapper):
+    """Chooses among discrete actions by a number."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = gymnasium.spaces.Box(0, 4.99, (1,), np.float64)
+
+    def action(self, action):
+        return int(action[0])
+
+
+def test_discrete_observations_of_continuous_actions_are_one_hot_whatever_the_dynamics_say_of_them():
+    options = {"answers": 1, "iterations": 1, "utility": "linear-program", "max_steps": 4, "centres": 9}
+    learner = bayespbrl.Learner(Scaled(gymnasium.make("bayespbrl/Gridworld-v0")), **QUICK | options)
+    learner.run(bayespbrl.ReturnExpert())
+    assert learner.trajectories[0].states.shape == (5, 25)
+    assert environment_attribute(learner.environment, "grid_shape") is None
+    assert environment_attribute(learner.environment, "optimal_return") > 0
+
+
+def test_a_smooth_utility_of_too_many_states_is_refused_before_anybody_is_asked():
+    class Many(gymnasium.Env):
+        observation_space, action_space = gymnasium.spaces.Discrete(1500), gymnasium.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return 0, {}
+
+        def step(self, action):
+            return int(action), 0.0, False, False, {}
+
+    with pytest.raises(ValueError, match="diffusion_utility: expected at most 1000 states, got 1500"):
+        bayespbrl.Learner(Many(), max_steps=5, answers=2, diffusion_utility=True)

@@ -642,6 +642,42 @@ def test_a_copy_whose_episode_has_ended_is_not_stepped_while_the_others_go_on():
         assert trajectory.terminated == steps[-1][2]
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class NotAtNought:
+    action: np.ndarray
+
+    def sample(self, key, observation):
+        return jnp.where(observation[0] <= 0, jnp.nan, self.action)
+
+
+class Countdown(gymnasium.Env):
+    observation_space, action_space = Box(-5, 5, (1,), np.float64), Box(-1, 1, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = float(self.np_random.integers(1, 4))
+        return np.array([self.left]), {}
+
+    def step(self, action):
+        self.left -= 1
+        return np.array([self.left]), 0.0, self.left <= 0, False, {}
+
+
+def test_no_policy_is_asked_for_an_action_after_the_end_of_an_episode():
+    gymnasium.register("bayespbrl-tests/Countdown-v0", entry_point=Countdown, max_episode_steps=9)
+    arguments = {"key": KEY, "episodes": 6, "max_steps": 9}
+    try:
+        run = [
+            rollout(env, NotAtNought(np.zeros(1)), **arguments) for env in (Countdown(), "bayespbrl-tests/Countdown-v0")
+        ]
+    finally:
+        del gymnasium.registry["bayespbrl-tests/Countdown-v0"]
+    for trajectories in run:
+        assert len({len(trajectory) for trajectory in trajectories}) > 1
+        assert all(trajectory.terminated for trajectory in trajectories)
+
+
 def test_a_single_object_runs_episode_by_episode_and_stays_open():
     class Closing(Plain):
         def close(self):

@@ -10,6 +10,7 @@ import re
 import shutil
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import gymnasium
@@ -971,6 +972,93 @@ def test_an_object_that_was_changed_since_it_was_made_is_asked_for_again(tmp_pat
     used.reset(seed=5)
     used.step(np.ones(1))
     assert bayespbrl.Learner(used, **QUICK | {"max_steps": 5}).settings.environment == "object"
+
+
+class Walk(gymnasium.Env):
+    """A walk whose pace, goal and noise are where an attribute that is a number does not tell."""
+
+    observation_space, action_space = gymnasium.spaces.Box(-99, 99, (1,)), gymnasium.spaces.Discrete(2)
+    made = 0
+
+    def __init__(self, seeded=True, single=False):
+        self.model, self.goal, self.seeded = SimpleNamespace(pace=1.0), {"at": [7, (3, 4)]}, seeded
+        type(self).made += 1
+        if single and type(self).made > 1:
+            raise RuntimeError("port 5005 is in use")
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed if self.seeded else None)
+        self.position = self.np_random.normal(size=1).astype(np.float32)
+        return self.position.copy(), {}
+
+    def step(self, action):
+        self.position += self.model.pace * (2 * action - 1)
+        return self.position.copy(), 0.0, False, False, {}
+
+
+@pytest.fixture
+def walks():
+    """Registers walks, and makes an object of one."""
+    names = []
+
+    def made(**arguments):
+        names.append(f"Walk{len(names)}-v0")
+        gymnasium.register(names[-1], entry_point=Walk, kwargs=arguments, max_episode_steps=5)
+        Walk.made = 0
+        return gymnasium.make(names[-1])
+
+    yield made
+    for name in names:
+        del gymnasium.registry[name]
+
+
+def test_an_object_whose_inner_parts_were_changed_is_asked_for_again(walks):
+    def how(env):
+        return Learner(env, **QUICK | {"utility": "linear-program"}).settings.environment
+
+    assert how(walks()) == "object"
+    faster, elsewhere = walks(), walks()
+    faster.unwrapped.model.pace = 2.0
+    elsewhere.unwrapped.goal["at"][1] = (3, 5)
+    assert how(faster) == how(elsewhere) == "other"
+    assert how(walks(seeded=False)) == "other"  # its position after a reset tells
+    assert how(walks(single=True)) == "other"  # there is only one
+
+
+def test_an_environment_of_which_there_is_only_one_is_named(walks):
+    name, Walk.made = walks(single=True).spec.id, 0
+    with pytest.raises(ValueError, match=rf"{name} failed at making copies of it, .* port 5005 is in use"):
+        Learner(name, **QUICK | {"utility": "linear-program"}).ask()
+
+
+def test_a_run_goes_on_as_it_is_stepped_by_name_or_as_an_object(tmp_path):
+    options = QUICK | {"utility": "linear-program", "max_steps": 5}
+    bayespbrl.start("Pendulum-v1", tmp_path / "named", **options).ask()
+    bayespbrl.start(gymnasium.make("Pendulum-v1"), tmp_path / "object", **options).ask()
+    opened = bayespbrl.load(tmp_path / "named").learner.environment
+    assert Learner(opened, **options).settings.environment == "named"
+    for directory, env, asked in (
+        ("named", gymnasium.make("Pendulum-v1"), "Pendulum-v1 by its name"),
+        ("object", "Pendulum-v1", "an object of Pendulum-v1 as made"),
+    ):
+        with pytest.raises(ValueError, match=f"{directory}: expected no env=, or {asked}, got .* go on otherwise"):
+            runs.resume(tmp_path / directory, env=env)
+        assert bayespbrl.load(tmp_path / directory, env=env).settings.environment == directory
+    for directory, env in (("named", "Pendulum-v1"), ("named", opened), ("object", gymnasium.make("Pendulum-v1"))):
+        assert runs.resume(tmp_path / directory, env=env).settings.environment == directory
+
+
+@pytest.mark.parametrize("dtype", [np.float16, complex])
+def test_a_policy_of_numbers_that_no_file_holds_is_refused_at_the_start(tmp_path, dtype):
+    @jax.tree_util.register_dataclass
+    @dataclasses.dataclass(frozen=True, eq=False)
+    class Noted(TabularPolicy):
+        note: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2, dtype))
+
+    policy = Noted(np.full((25, 5), 0.2), 0.01)
+    with pytest.raises(ValueError, match=r"expected an array of real numbers of 32 or 64 bits in Noted.note, got "):
+        start(tmp_path / "run", policy=policy)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_of_an_object_that_nobody_registers_any_more_is_one_line(tmp_path):

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator
+from copy import deepcopy
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from bayespbrl.envs.spaces import bounded, from_plain, plain_space, to_plain
 OF_OBSERVATIONS = ("observation_period", "observation_names", "draw", "draw_trajectory", "pose", "grid_shape")
 OF_MAKE = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
 ONLY_LOOKING = (*OF_MAKE, RecordEpisodeStatistics, RecordVideo, RenderCollection, HumanRendering)  # change nothing seen
+STEPS_COMPARED = 10
 MOST_NUMBERS = 1000  # of an observation: radial functions of it take 1 MB a number, and thrice that with more centres
 AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
 
@@ -112,10 +114,10 @@ def reopened(environment: object) -> str:
     """
     if isinstance(environment, str):
         return "named"
-    if not given_by_name(environment) or (isinstance(environment, gymnasium.Env) and _changed(environment)):
+    given = as_given(environment) if isinstance(environment, gymnasium.Env) else environment
+    if not given_by_name(given) or (isinstance(given, gymnasium.Env) and _changed(given)):
         return "other"
-    stepped = isinstance(environment, gymnasium.Env) and not isinstance(environment.unwrapped, FunctionalEnv)
-    return "object" if stepped else "named"
+    return "object" if isinstance(environment, gymnasium.Env) and made_from(environment) is None else "named"
 
 
 def made_again(name: str) -> gymnasium.Env:
@@ -137,23 +139,52 @@ def given_by_name(environment: object) -> bool:
 
 
 def _changed(environment: gymnasium.Env) -> bool:
-    """Whether an attribute of an environment, as `g` of Pendulum, is no longer what gymnasium made of its name.
+    """Whether an environment, as a Pendulum with another `g`, is no longer what gymnasium made of its name.
 
-    Compared are numbers, texts and arrays after a reset with the same seed. What cannot reset says so when it is used.
+    Compared are attributes after a reset with the same seed, and what a few steps return; of one that does not return
+    twice the same, the attributes alone. What cannot reset or step says so when it is used. One that cannot be made
+    again, such as a robot, has to be given again too.
     """
     spec = environment.spec
     assert spec is not None
-    again = _make(gymnasium.spec(spec.id))
     try:
+        again = _make(gymnasium.spec(spec.id))
+    except ValueError:
+        return True
+    try:
+        seen = [_first_steps(one, again.action_space) for one in (environment, again, again)]
         for one in (environment, again):
             one.reset(seed=0)
     except Exception:  # whatever an environment of the user's raises
         return False
+    finally:
+        again.close()
     mine, made = vars(environment.unwrapped), vars(again.unwrapped)
-    again.close()
+    if not all(_alike(mine[name], made[name]) for name in mine.keys() & made.keys() - {"render_mode"}):
+        return True
+    return _alike(seen[1], seen[2]) and not _alike(seen[0], seen[1])
+
+
+def _first_steps(env: gymnasium.Env, actions: Space[Any]) -> list[Any]:
+    """What a reset and a few steps return without their infos, always by the same actions."""
+    actions.seed(0)
+    seen: list[Any] = [deepcopy(env.reset(seed=0)[0])]
+    for _ in range(STEPS_COMPARED):
+        observation, *rest, _ = env.step(actions.sample())
+        seen.append(deepcopy((observation, *rest)))
+        if rest[1] or rest[2]:  # terminated or truncated
+            break
+    return seen
+
+
+def _alike(mine: Any, made: Any, depth: int = 5) -> bool:
+    """Whether two values are equal, as far as they are plain ones, or consist of such."""
+    if isinstance(mine, dict) and isinstance(made, dict):
+        return mine.keys() == made.keys() and (not depth or all(_alike(mine[k], made[k], depth - 1) for k in mine))
+    if isinstance(mine, list | tuple) and isinstance(made, list | tuple):
+        return len(mine) == len(made) and (not depth or all(map(_alike, mine, made, [depth - 1] * len(mine))))
     plain = (bool, int, float, str, np.ndarray, np.generic)
-    both = [name for name in mine.keys() & made.keys() if isinstance(mine[name], plain) and name != "render_mode"]
-    return not all(_same(mine[name], made[name]) for name in both if isinstance(made[name], plain))
+    return not (isinstance(mine, plain) and isinstance(made, plain)) or _same(mine, made)
 
 
 def identity(environment: object) -> str | None:
@@ -173,7 +204,9 @@ def _spec_of(environment: object) -> EnvSpec | None:
 def _same(first: Any, second: Any) -> bool:
     """Whether two arguments are equal, arrays too; False where they cannot be compared."""
     try:
-        return bool(np.array_equal(first, second) if isinstance(first, np.ndarray) else first == second)
+        if isinstance(first, np.ndarray):
+            return bool(np.array_equal(first, second, equal_nan=first.dtype.kind in "fc"))
+        return bool(first == second or (first != first and second != second))
     except ValueError:
         return False
 
@@ -193,7 +226,8 @@ def observed_otherwise(env: gymnasium.Env) -> bool:
     given, inner = as_given(env), env.unwrapped
     *wrappers, _ = layers(given)
     changed = not all(type(layer) in ONLY_LOOKING or _passes_observations(layer) for layer in wrappers)
-    return changed or given.observation_space != inner.observation_space
+    one_hot = isinstance(inner.observation_space, Discrete) and not isinstance(env.observation_space, Discrete)
+    return changed or one_hot or given.observation_space != inner.observation_space
 
 
 def _passes_observations(wrapper: gymnasium.Env) -> bool:

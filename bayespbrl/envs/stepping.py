@@ -91,7 +91,8 @@ def episodes_by_interface(
         its discrete space; names it and the step.
     """
     lanes = min(episodes, MAX_LANES) if made_from(env) is not None else 1
-    vector = _copies(env, lanes, time_limit, one_by_one=not isinstance(seeds, int))
+    with _blaming(environment_name(env), "making copies of it, which an object of it does without"):
+        vector = _copies(env, lanes, time_limit, one_by_one=not isinstance(seeds, int))
     try:
         for first in range(0, episodes, lanes):
             if isinstance(seeds, int):
@@ -228,13 +229,12 @@ def _batch(
     states, actions, rewards = [check_observed(env, "its reset", _wide(seen, observations))], [], []
     t = 0
     while t < steps and alive.any():
-        actions.append(_within(done, act(first, t, states[-1])))
+        actions.append(_within(done, act(first, t, _of_running(alive, states[-1], states[0]))))
         t += 1
         with _blaming(name, f"step {t}"):
             observations, reward, terminated, truncated, _ = vector.step(actions[-1].copy())  # which it may change
         check_observed(env, f"step {t}", _wide(seen, observations)[alive], np.asarray(reward)[alive])
-        # what idle lanes return must not reach the policy as NaN
-        states.append(np.nan_to_num(_wide(seen, observations)))
+        states.append(_wide(seen, observations))
         rewards.append(np.array(reward, float))  # a copy: the environment may write to its own anew
         lengths += alive
         ended |= alive & terminated
@@ -244,6 +244,11 @@ def _batch(
         (table[0][: n + 1, i].copy(), table[1][:n, i].copy(), table[2][:n, i].copy(), bool(ended[i]))
         for i, n in enumerate(lengths)
     ]
+
+
+def _of_running(alive: Bool[np.ndarray, " n"], now: Rows, first: Rows) -> Rows:
+    """The observations to act on: where a lane has ended its first, as a policy may not be defined at its last."""
+    return np.where(alive.reshape(-1, *[1] * (now.ndim - 1)), now, first)
 
 
 def _wide(space: gymnasium.Space[Any], values: ArrayLike) -> Rows:

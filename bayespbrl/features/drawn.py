@@ -108,6 +108,12 @@ class FeatureSource:
     period: ArrayLike | None = None
     own: StateFeatures | None = None
 
+    def check(self, options: RadialBasisOptions) -> None:
+        """`ValueError` where features of states by these options cannot be drawn, whatever will be observed."""
+        space = self.observation_space
+        if options.diffusion and isinstance(space, Discrete) and space.n > MOST_CONNECTED:
+            raise ValueError(f"diffusion_utility: expected at most {MOST_CONNECTED} states, got {space.n}")
+
     def of_states(
         self, trajectories: Sequence[Trajectory], options: RadialBasisOptions, *, rng: np.random.Generator
     ) -> StateFeatures:
@@ -115,6 +121,7 @@ class FeatureSource:
 
         Where all are equally long and none ended by itself, no constant feature is drawn.
         """
+        self.check(options)
         equally_long = len({len(each) for each in trajectories}) == 1
         if self.own is not None:
             observed = _observed(trajectories)
@@ -122,8 +129,6 @@ class FeatureSource:
             return OwnFeatures.in_any_units(self.own, states, of_equal_lengths=equally_long)
         space = self.observation_space
         if options.diffusion and isinstance(space, Discrete):
-            if space.n > MOST_CONNECTED:
-                raise ValueError(f"diffusion_utility: expected at most {MOST_CONNECTED} states, got {space.n}")
             return diffusion_basis(trajectories, int(space.n))
         if options.standardised and isinstance(space, Discrete):
             return standardised(trajectories, int(space.n))

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import checks, rollouts
-from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, made_again
+from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, made_again, reopened
 from bayespbrl.envs.spaces import check_of_space, spaces_of
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.features import StateFeatures
@@ -42,6 +42,7 @@ def start(
       directory: must not exist; a fresh one under `runs/` when None.
       **options: as in `Learner`. With `expert="other"` a person answers through code of your own: the learner uses its
         settings for people, infers a side bias, and continues in Python or with `bayespbrl ask`, not with `resume`.
+        The expert that the options `expert` and `wrong_answers` name is `expert_of(learner)`.
 
     Raises:
       ValueError: bad options, or a directory that exists; nothing is left behind then.
@@ -73,12 +74,15 @@ def resume(
         may be a stranger's, and importing runs code.
 
     Raises:
-      ValueError: a package that may not be imported; an environment with other states or actions than the run's; a
-        directory that is no run or cannot be written, or a file in it that is truncated or foreign; a run to which
-        another learner has written since it was read.
+      ValueError: a package that may not be imported; an environment with other states or actions than the run's, or
+        an object in place of a name; a directory that is no run or cannot be written, or a file in it that is truncated
+        or foreign; a run to which another learner has written since it was read.
     """
     log = _opened(directory, env, import_package)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)
+    if env is not None and (how := log.settings.environment) != "other" and reopened(env) != how:
+        asked = f"{log.settings.env} by its name" if how == "named" else f"an object of {log.settings.env} as made"
+        raise ValueError(f"{log.path}: expected no env=, or {asked}, got {env}, with which it would go on otherwise")
     try:
         log.take_over()
         log.write_summary(learner.state)  # outdated where a process was killed between an event and its summary
