@@ -376,6 +376,44 @@ def test_what_no_answer_touches_keeps_the_prior_scale():
     assert stats.kstest(weights.ravel(), stats.norm(scale=2.0).cdf).pvalue > 1e-3
 
 
+def by_many_weights(settings, answerers, number=40_000):
+    """Probabilities of settings of two features, and the evidence, by weights from the prior; the rest is summed up."""
+    rng, evidence, k = np.random.default_rng(0), [], settings.shape[1]
+    rates = priors.LAPSE_RATE
+    for rows in settings:
+        margins = rng.standard_normal((number, 2)) @ rows.T
+        sigmoid = expit(rng.choice(priors.STEEPNESS.values, (number, 1), p=priors.STEEPNESS.probabilities) * margins)
+        attentive = ((k - 1) * (margins > 0) + sigmoid) / k  # eq. 8
+        log_p = 0.0
+        for person in np.unique(answerers):
+            theirs = attentive[:, answerers == person]
+            each = [np.log(rate / 2 + (1 - rate) * theirs).sum(axis=1) for rate in rates.values]
+            log_p = log_p + logsumexp(np.array(each) + np.log(rates.probabilities)[:, None], axis=0)
+        evidence.append(logsumexp(log_p) - np.log(number))
+    whole = logsumexp(evidence)
+    return np.exp(evidence - whole), whole - np.log(len(settings))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("people", [1, 2])
+def test_no_setting_is_lost_where_more_answers_err_than_expected(people):
+    rng = np.random.default_rng(1)
+    rows = rng.standard_normal((40, 2)) / 1.4
+    signs = np.sign(rows @ [1.0, -0.5])
+    signs[rng.random(40) < 0.25] *= -1  # a quarter is wrong
+    rows *= signs[:, None]
+    rng = np.random.default_rng(1)
+    noisy = [rows + noise * rng.standard_normal(rows.shape) for noise in (0.3, 0.6)]
+    settings = np.stack([rows, rows @ [[0.8, 0.6], [-0.6, 0.8]], *noisy, rows * [1.4, 0.2]])
+    answerers = np.random.default_rng(101).integers(people, size=40)
+    tree = sample_posterior(settings, steepness=None, lapse_rate=None, answerers=answerers if people > 1 else None)
+    expected, evidence = by_many_weights(settings, answerers)
+    drawn = tree["posterior"]["setting"].values
+    assert tree.attrs["converged"]
+    np.testing.assert_allclose([np.mean(drawn == c) for c in range(5)], expected, atol=0.08)
+    assert abs(tree.attrs["log_evidence"] - evidence) < 4 * tree.attrs["log_evidence_error"] + 0.05 < 1
+
+
 @pytest.mark.parametrize(("rhat", "size", "fine"), [(1.009, 401, True), (1.02, 401, False), (1.009, 390, False)])
 def test_the_limits_of_convergence_are_those_of_vehtari_and_others(rhat, size, fine):
     report = Convergence(np.array([1.0, rhat]), np.array([1e4, size]), np.zeros(2))

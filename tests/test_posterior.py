@@ -409,10 +409,22 @@ def test_the_posterior_finds_the_length_scale_that_ordered_the_pairs():
         ({"differences": [[1e50], [-1.0]]}, r"differences: expected the largest between 1e-30 and 1e\+30, got 1e\+50"),
         ({"differences": [[-1e-50]]}, "differences: expected the largest between .* got 1e-50; divide"),
         ({"differences": {1: 2}}, "differences: expected rows of numbers"),
+        ({"differences": np.ones((2, 1, 2), complex)}, "differences: expected"),
+        ({"differences": np.ma.masked_array(np.ones((2, 1, 2)), mask=True)}, "differences: expected"),
         ({"indifferent": np.array([True]), "tie_threshold": 0.1}, "indifferent: expected"),
         ({"tie_threshold": 0.0}, "tie_threshold: expected"),
+        ({"tie_threshold": 1e-17}, "tie_threshold: expected 1.*e-12 to 1"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         sample_posterior(**{"differences": np.ones((2, 3)), **arguments})
+
+
+def test_a_tie_threshold_is_in_units_of_the_margins_whatever_those_of_the_features():
+    rows, tied = np.array([[1.0, 0.2], [0.3, -1.0], [0.1, 0.1]]), np.array([False, False, True])
+    options = {"indifferent": tied, "steepness": None, "lapse_rate": None, "num_samples": 50, "max_samples": 50}
+    here = sample_posterior(rows, **options)["posterior"]["tie_threshold"]
+    far = sample_posterior(rows * 1e7, prior_scale=1e-7, **options)["posterior"]["tie_threshold"]
+    assert 0.5 < float(far.mean() / here.mean()) < 2
+    sample_posterior(rows * 1e7, prior_scale=1e-7, **options | {"tie_threshold": 0.2})

@@ -420,7 +420,8 @@ BAD_ARGUMENTS = [
     ({"prior_scale": -1.0}, "prior_scale: expected a positive"),
     ({"prior_scale": 1e-155}, "prior_scale: expected a number from 1e-30 to 1e[+]30, got 1e-155"),
     ({"prior_scale": 1e155}, "prior_scale: expected a number from 1e-30 to 1e[+]30, got 1e[+]155"),
-    ({"tie_threshold": 1e20}, "tie_threshold: expected at most 1e[+]06 times prior_scale, 1, got 1e[+]20"),
+    ({"tie_threshold": 1e20}, "tie_threshold: expected .* have a prior standard deviation of .*, got 1e[+]20"),
+    ({"tie_threshold": 1e-20}, "tie_threshold: expected .* have a prior standard deviation of .*, got 1e-20"),
 ]
 
 

@@ -15,6 +15,7 @@ from bayespbrl.models.preference_model import PreferenceModel
 from bayespbrl.models.threads import one_blas_thread
 
 NOW_AND_THEN = 0.05  # lapse rate of the Gaussian where answers without lapses contradict each other
+MORE_LAPSES, BELOW_CHANCE = (0.3, 0.55, 0.8), 10.0  # nats
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,10 @@ def _approximation(
 
     Decision: where answers contradict each other and nobody lapses, each is a step that squeezes the Gaussian between
     them, until it is a thousandth as wide as the posterior: chains would all start at one point. It is then that of
-    answerers who lapse now and then.
+    answerers who lapse now and then. So do answers that contradict each other more often than the lapse rate allows,
+    and a setting with such a reference is never entered. What is then less probable by far than coin tosses gets the
+    most probable Gaussian of larger lapse rates. (With a quarter of 40 answers about two features wrong, and a
+    lapse rate of 0.125, no chain had a draw of four settings out of five, which have 0.81 of the posterior.)
     """
     used = used_rows(factors.loadings)
     loadings = factors.loadings[used]
@@ -116,11 +120,17 @@ def _approximation(
         mixture = answers.probit_mixture().of(used)
         return expectation_propagation(loadings, mixture, prior_scale=prior_scale, widening=widening)
 
-    fit = fitted(likelihood)
-    if isinstance(likelihood, WithLapses) or not has_steps(likelihood):
+    fit, ties = fitted(likelihood), ties_of(likelihood)
+    if not has_steps(likelihood):
         return fit
-    ties = ties_of(likelihood)
     ordered = np.ones(len(loadings), dtype=bool) if ties is None else ~np.asarray(ties.indifferent)[used]
+    if isinstance(likelihood, WithLapses):
+        by_chance = -np.log(likelihood.choices) * len(loadings)
+        if fit.log_evidence >= by_chance - BELOW_CHANCE:
+            return fit
+        rates = [rate for rate in MORE_LAPSES if rate > likelihood.lapse_rate]
+        fits = [fit, *(fitted(replace(likelihood, lapse_rate=rate)) for rate in rates)]
+        return max(fits, key=lambda each: np.nan_to_num(each.log_evidence, nan=-np.inf))
     if np.all(loadings[ordered] @ fit.mean >= 0):
         return fit
     return replace(fitted(WithLapses(likelihood, NOW_AND_THEN)), log_evidence=fit.log_evidence)

@@ -139,6 +139,7 @@ def posterior_draws(
     seed = checks.seed(seed)
     sampler = SamplerOptions() if sampler is None else sampler
     settings = settings_of(differences)
+    model.check_threshold(np.sqrt(np.mean(np.sum(settings**2, axis=2), axis=1).max()) if settings.size else 0.0)
     answers = answers.checked(settings.shape[1])
     number = settings.shape[1]
     if number_of_preferences is not None:

@@ -16,7 +16,8 @@ from bayespbrl.models.likelihoods import LIKELIHOODS, Likelihood, Scalar, likeli
 from bayespbrl.models.priors import Grid
 
 # Beyond these, squares and densities are no numbers any more. Of a threshold so wide every answer is a tie.
-LEAST_SCALE, LARGEST_SCALE, WIDEST_TIE = 1e-30, 1e30, 1e6
+LEAST_SCALE, LARGEST_SCALE = 1e-30, 1e30
+TIES = 1e-12, 1e6  # prior standard deviations of the margins that a given threshold may have
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,18 @@ class PreferenceModel:
         checks.optional(checks.positive, "steepness", self.steepness)
         checks.optional(checks.share, "lapse_rate", self.lapse_rate, below_one=True)
         checks.optional(checks.positive, "tie_threshold", self.tie_threshold)
-        if self.tie_threshold is not None and self.tie_threshold > WIDEST_TIE * self.prior_scale:
+
+    def check_threshold(self, length: float) -> None:
+        """`ValueError` where a given threshold is so far from the margins that densities are no numbers any more.
+
+        `length` is the root mean square length of the differences; 0 where all are zero.
+        """
+        deviation = self.prior_scale * float(length or 1.0)
+        least, most = (each * deviation for each in TIES)
+        if self.tie_threshold is not None and not least <= self.tie_threshold <= most:
             raise ValueError(
-                f"tie_threshold: expected at most {WIDEST_TIE:g} times prior_scale, {self.prior_scale:g}, got "
-                f"{self.tie_threshold!r}"
+                f"tie_threshold: expected {least:g} to {most:g}, as the margins have a prior standard deviation of "
+                f"{deviation:g}, got {self.tie_threshold!r}"
             )
 
     @property
