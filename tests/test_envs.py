@@ -394,5 +394,7 @@ def test_a_smooth_utility_of_too_many_states_is_refused_before_anybody_is_asked(
         def step(self, action):
             return int(action), 0.0, False, False, {}
 
+    options = {"max_steps": 5, "answers": 2, "diffusion_utility": True}
     with pytest.raises(ValueError, match="diffusion_utility: expected at most 1000 states, got 1500"):
-        bayespbrl.Learner(Many(), max_steps=5, answers=2, diffusion_utility=True)
+        bayespbrl.Learner(Many(), **options)
+    bayespbrl.Learner(Many(), features=lambda states: np.eye(2)[np.minimum(states, 1)], **options)

@@ -421,6 +421,12 @@ def test_bad_arguments_are_named(arguments, message):
         sample_posterior(**{"differences": np.ones((2, 3)), **arguments})
 
 
+def test_differences_may_have_names():
+    tree = sample_posterior(np.array([[[1.0, 0.2]], [[0.3, -1.0]]]), num_samples=20, max_samples=20)
+    again = sample_posterior(tree["constant_data"]["differences"], num_samples=20, max_samples=20)
+    np.testing.assert_array_equal(again["posterior"]["coordinates"], tree["posterior"]["coordinates"])
+
+
 def test_a_tie_threshold_is_in_units_of_the_margins_whatever_those_of_the_features():
     rows, tied = np.array([[1.0, 0.2], [0.3, -1.0], [0.1, 0.1]]), np.array([False, False, True])
     options = {"indifferent": tied, "steepness": None, "lapse_rate": None, "num_samples": 50, "max_samples": 50}

@@ -664,7 +664,7 @@ class Countdown(gymnasium.Env):
         return np.array([self.left]), 0.0, self.left <= 0, False, {}
 
 
-def test_no_policy_is_asked_for_an_action_after_the_end_of_an_episode():
+def test_no_policy_is_asked_for_an_action_at_the_last_observation_of_an_episode():
     gymnasium.register("bayespbrl-tests/Countdown-v0", entry_point=Countdown, max_episode_steps=9)
     arguments = {"key": KEY, "episodes": 6, "max_steps": 9}
     try:

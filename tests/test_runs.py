@@ -982,6 +982,7 @@ class Walk(gymnasium.Env):
 
     def __init__(self, seeded=True, single=False):
         self.model, self.goal, self.seeded = SimpleNamespace(pace=1.0), {"at": [7, (3, 4)]}, seeded
+        self.episodes, self.starts = 0, []  # over its lifetime
         type(self).made += 1
         if single and type(self).made > 1:
             raise RuntimeError("port 5005 is in use")
@@ -989,6 +990,8 @@ class Walk(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed if self.seeded else None)
         self.position = self.np_random.normal(size=1).astype(np.float32)
+        self.episodes += 1
+        self.starts.append(self.position.copy())
         return self.position.copy(), {}
 
     def step(self, action):
@@ -1046,6 +1049,8 @@ def test_a_run_goes_on_as_it_is_stepped_by_name_or_as_an_object(tmp_path):
         assert bayespbrl.load(tmp_path / directory, env=env).settings.environment == directory
     for directory, env in (("named", "Pendulum-v1"), ("named", opened), ("object", gymnasium.make("Pendulum-v1"))):
         assert runs.resume(tmp_path / directory, env=env).settings.environment == directory
+    start(tmp_path / "compiled").ask()
+    assert runs.resume(tmp_path / "compiled", env=gymnasium.make("bayespbrl/Gridworld-v0")).state.queries == 1
 
 
 @pytest.mark.parametrize("dtype", [np.float16, complex])
@@ -1056,7 +1061,7 @@ def test_a_policy_of_numbers_that_no_file_holds_is_refused_at_the_start(tmp_path
         note: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2, dtype))
 
     policy = Noted(np.full((25, 5), 0.2), 0.01)
-    with pytest.raises(ValueError, match=r"expected an array of real numbers of 32 or 64 bits in Noted.note, got "):
+    with pytest.raises(ValueError, match=r"expected real numbers of 32 or 64 bits in Noted.note, got "):
         start(tmp_path / "run", policy=policy)
     assert not (tmp_path / "run").exists()
 

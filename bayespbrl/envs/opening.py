@@ -108,16 +108,23 @@ def environment_name(env: gymnasium.Env) -> str:
 def reopened(environment: object) -> str:
     """How the name alone opens the same environment again, by a value of the setting `environment`.
 
-    `named`: by its name. `object`: made by gymnasium from its name; an object is stepped alone, where many copies of a
-    name are stepped side by side. `other`: not at all, since it was made with other arguments, changed since, wrapped,
-    or never registered.
+    `named`: by its name, or pure functions, which run alike. `object`: made by gymnasium from its name; an object is
+    stepped alone, where many copies of a name are stepped side by side. `other`: not at all, since it was made with
+    other arguments, changed since, wrapped, or never registered.
     """
     if isinstance(environment, str):
         return "named"
     given = as_given(environment) if isinstance(environment, gymnasium.Env) else environment
     if not given_by_name(given) or (isinstance(given, gymnasium.Env) and _changed(given)):
         return "other"
-    return "object" if isinstance(environment, gymnasium.Env) and made_from(environment) is None else "named"
+    stepped = isinstance(environment, gymnasium.Env) and made_from(environment) is None and not _compiled(environment)
+    return "object" if stepped else "named"
+
+
+def _compiled(env: gymnasium.Env) -> bool:
+    """Whether pure functions are all that there is to an environment, so that they run, and nothing is stepped."""
+    inner = env.unwrapped
+    return isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and plainly_wrapped(flattened(env))
 
 
 def made_again(name: str) -> gymnasium.Env:
@@ -152,17 +159,17 @@ def _changed(environment: gymnasium.Env) -> bool:
     except ValueError:
         return True
     try:
-        seen = [_first_steps(one, again.action_space) for one in (environment, again, again)]
+        mine, made = (_first_steps(one, again.action_space) for one in (environment, again))
         for one in (environment, again):
             one.reset(seed=0)
+        ours, theirs = vars(environment.unwrapped), vars(again.unwrapped)
+        if not all(_alike(ours[name], theirs[name]) for name in ours.keys() & theirs.keys() - {"render_mode"}):
+            return True
+        return not _alike(mine, made) and _alike(made, _first_steps(again, again.action_space))
     except Exception:  # whatever an environment of the user's raises
         return False
     finally:
         again.close()
-    mine, made = vars(environment.unwrapped), vars(again.unwrapped)
-    if not all(_alike(mine[name], made[name]) for name in mine.keys() & made.keys() - {"render_mode"}):
-        return True
-    return _alike(seen[1], seen[2]) and not _alike(seen[0], seen[1])
 
 
 def _first_steps(env: gymnasium.Env, actions: Space[Any]) -> list[Any]:
@@ -207,7 +214,7 @@ def _same(first: Any, second: Any) -> bool:
         if isinstance(first, np.ndarray):
             return bool(np.array_equal(first, second, equal_nan=first.dtype.kind in "fc"))
         return bool(first == second or (first != first and second != second))
-    except ValueError:
+    except (TypeError, ValueError):
         return False
 
 

@@ -134,7 +134,7 @@ class _Silent(gymnasium.Wrapper):
     """One episode after each reset with a seed, without infos.
 
     Nobody reads infos, and copies side by side fail where theirs are of different form. A copy whose episode has ended
-    waits for the others: where it returns its last observation, nothing is stepped.
+    waits for the others: it returns its last observation, and nothing is stepped.
     """
 
     _last: Any = None  # observation of an episode that has ended
@@ -247,7 +247,7 @@ def _batch(
 
 
 def _of_running(alive: Bool[np.ndarray, " n"], now: Rows, first: Rows) -> Rows:
-    """The observations to act on: where a lane has ended its first, as a policy may not be defined at its last."""
+    """The observations to act on; a lane that has ended shows its first, as a policy may not be defined at its last."""
     return np.where(alive.reshape(-1, *[1] * (now.ndim - 1)), now, first)
 
 

@@ -111,7 +111,7 @@ class FeatureSource:
     def check(self, options: RadialBasisOptions) -> None:
         """`ValueError` where features of states by these options cannot be drawn, whatever will be observed."""
         space = self.observation_space
-        if options.diffusion and isinstance(space, Discrete) and space.n > MOST_CONNECTED:
+        if self.own is None and options.diffusion and isinstance(space, Discrete) and space.n > MOST_CONNECTED:
             raise ValueError(f"diffusion_utility: expected at most {MOST_CONNECTED} states, got {space.n}")
 
     def of_states(

@@ -28,7 +28,8 @@ class GaussianFit:
       factors: Ψ = L Qᵀ.
       likelihood: p of these answers.
       approximation: expectation propagation's, of z.
-      log_evidence: expectation propagation's log marginal likelihood of all answers, rows of zeros included, nats.
+      log_evidence: expectation propagation's log marginal likelihood of all answers, rows of zeros included, nats;
+        where the approximation is that of more lapses, under these. It decides where chains start.
     """
 
     differences: Float[np.ndarray, "k d"]
@@ -108,9 +109,9 @@ def _approximation(
 
     Decision: where answers contradict each other and nobody lapses, each is a step that squeezes the Gaussian between
     them, until it is a thousandth as wide as the posterior: chains would all start at one point. It is then that of
-    answerers who lapse now and then. So do answers that contradict each other more often than the lapse rate allows,
-    and a setting with such a reference is never entered. What is then less probable by far than coin tosses gets the
-    most probable Gaussian of larger lapse rates. (With a quarter of 40 answers about two features wrong, and a
+    answerers who lapse now and then. Answers that contradict each other more often than the lapse rate allows squeeze
+    it too, and a setting with such a reference is never entered. Where they are far less probable than coin tosses, it
+    is the most probable of those of larger lapse rates. (With a quarter of 40 answers about two features wrong, and a
     lapse rate of 0.125, no chain had a draw of four settings out of five, which have 0.81 of the posterior.)
     """
     used = used_rows(factors.loadings)

@@ -34,7 +34,7 @@ def settings_of(differences: ArrayLike) -> Float[np.ndarray, "s k d"]:
     if array.ndim != 3:
         array = checks.matrix("differences", differences)[None]
     elif array.size:
-        checks.matrix("differences", np.reshape(differences, (-1, array.shape[2])))  # masked
+        checks.matrix("differences", np.asanyarray(differences).reshape(-1, array.shape[2]))  # masked
     checks.finite("differences", array)
     if not array.shape[0] or not array.shape[2]:
         raise ValueError(f"differences: expected shape (K, D >= 1) or (C, K, D), got {np.shape(differences)}")

@@ -75,8 +75,8 @@ def resume(
 
     Raises:
       ValueError: a package that may not be imported; an environment with other states or actions than the run's, or
-        an object in place of a name; a directory that is no run or cannot be written, or a file in it that is truncated
-        or foreign; a run to which another learner has written since it was read.
+        an object in place of a name or the other way round; a directory that is no run or cannot be written, or a file
+        in it that is truncated or foreign; a run to which another learner has written since it was read.
     """
     log = _opened(directory, env, import_package)
     learner = _restored(log, env, features=features, policy=policy, schedule=schedule, query=query)

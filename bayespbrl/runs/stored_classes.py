@@ -50,10 +50,10 @@ def to_tree(instance: Any, *, without: Collection[str] = ()) -> xr.DataTree:
         value = getattr(instance, name)
         if isinstance(value, np.ndarray | jax.Array):
             array = np.asarray(value)
-            if array.dtype.kind not in "biuf" or array.dtype == np.float16:
+            if array.dtype.kind == "c" or array.dtype == np.float16:  # which netCDF has not
                 raise ValueError(
-                    f"stored class: expected an array of real numbers of 32 or 64 bits in {type(instance).__name__}."
-                    f"{name}, got {array.dtype}"
+                    f"stored class: expected real numbers of 32 or 64 bits in {type(instance).__name__}.{name}, got "
+                    f"{array.dtype}"
                 )
             arrays[name] = ([f"{name}_{axis}" for axis in range(array.ndim)], array)
         elif dataclasses.is_dataclass(value):
