@@ -494,11 +494,11 @@ def test_there_are_no_further_moves_with_one_setting_or_many_answers():
 
 
 @pytest.mark.slow
-def test_settings_in_which_single_chains_used_to_stay_are_visited_by_all():
-    # A run on MountainCarContinuous-v0, seed 3855: after 2000 draws R̂ was 3.6, after 8000 1.4, and lapses took 0.28 of
-    # the answers. Further moves mended that, and references that expect more lapses make them unnecessary here.
+def test_chains_that_stay_in_a_setting_which_others_hardly_visit_begin_anew_with_further_moves():
+    # A run on MountainCarContinuous-v0, seed 3855: after 2000 draws of the other moves alone R̂ was 3.6, after 8000 1.4,
+    # and lapses took 0.28 of the answers.
     settings = np.load(Path(__file__).parent / "data" / "stuck_between_settings.npy").astype(float)
-    trees = [sample_posterior(settings, **INFERRED, num_samples=1000, seed=seed) for seed in (0, 1)]
+    trees = [sample_posterior(settings, **INFERRED, seed=seed) for seed in (0, 1)]
     assert all(tree.attrs["converged"] for tree in trees)
     first, second = (tree["posterior/lapse_rate"].values.mean() for tree in trees)
     assert abs(first - second) < 0.03

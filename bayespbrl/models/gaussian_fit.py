@@ -15,7 +15,7 @@ from bayespbrl.models.preference_model import PreferenceModel
 from bayespbrl.models.threads import one_blas_thread
 
 NOW_AND_THEN = 0.05  # lapse rate of the Gaussian where answers without lapses contradict each other
-MORE_LAPSES, BELOW_CHANCE = (0.3, 0.55, 0.8), 10.0  # nats
+MORE_LAPSES, BELOW_CHANCE, MANY = (0.3, 0.55, 0.8), 10.0, 2  # nats; answers for each dimension
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,10 @@ def _approximation(
     Decision: where answers contradict each other and nobody lapses, each is a step that squeezes the Gaussian between
     them, until it is a thousandth as wide as the posterior: chains would all start at one point. It is then that of
     answerers who lapse now and then. Answers that contradict each other more often than the lapse rate allows squeeze
-    it too, and a setting with such a reference is never entered. Where they are far less probable than coin tosses, it
-    is the most probable of those of larger lapse rates. (With a quarter of 40 answers about two features wrong, and a
-    lapse rate of 0.125, no chain had a draw of four settings out of five, which have 0.81 of the posterior.)
+    it too, and a setting with such a reference is never entered. Where many about few dimensions are far less probable
+    than coin tosses, it is the most probable of those of larger lapse rates. (With a quarter of 40 answers about two
+    features wrong, and a lapse rate of 0.125, no chain had a draw of four settings out of five, which have 0.81 of the
+    posterior.)
     """
     used = used_rows(factors.loadings)
     loadings = factors.loadings[used]
@@ -126,8 +127,9 @@ def _approximation(
         return fit
     ordered = np.ones(len(loadings), dtype=bool) if ties is None else ~np.asarray(ties.indifferent)[used]
     if isinstance(likelihood, WithLapses):
-        by_chance = -np.log(likelihood.choices) * len(loadings)
-        if fit.log_evidence >= by_chance - BELOW_CHANCE:
+        number, dimension = loadings.shape
+        by_chance = -np.log(likelihood.choices) * number
+        if number < MANY * dimension or fit.log_evidence >= by_chance - BELOW_CHANCE:
             return fit
         rates = [rate for rate in MORE_LAPSES if rate > likelihood.lapse_rate]
         fits = [fit, *(fitted(replace(likelihood, lapse_rate=rate)) for rate in rates)]
