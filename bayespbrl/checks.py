@@ -140,6 +140,15 @@ def finite(name: str, values: Any) -> None:
 
 def matrix(name: str, values: Any, *, columns: int | None = None) -> np.ndarray:
     """`values` as a finite float64 array of shape (N, columns); any number of columns when None."""
+    array = reals(name, values)
+    if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
+        raise ValueError(f"{name}: expected shape (N, {'D' if columns is None else columns}), got {array.shape}")
+    finite(name, array)
+    return array
+
+
+def reals(name: str, values: Any) -> np.ndarray:
+    """`values` as a float64 array of any shape, where they are real numbers, NaN and infinity among them."""
     try:
         given = np.asarray(values)
         array = np.asarray(given.real, dtype=np.float64)
@@ -149,9 +158,6 @@ def matrix(name: str, values: Any, *, columns: int | None = None) -> np.ndarray:
         raise ValueError(f"{name}: expected real numbers, got masked or complex entries")
     if given.dtype.kind in "mM":
         raise ValueError(f"{name}: expected real numbers, got dates or times; say in which unit, from which day")
-    if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
-        raise ValueError(f"{name}: expected shape (N, {'D' if columns is None else columns}), got {array.shape}")
-    finite(name, array)
     return array
 
 

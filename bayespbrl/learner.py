@@ -75,10 +75,11 @@ class Learner:
                 f"environment: expected the environment as env only, got environment={options['environment']!r} too"
             )
         own_policy = None if policy is None or isinstance(policy, str) else policy
+        how = "named" if kept is not None else opening.reopened(env)
         own = {
             "policy": policy if own_policy is None else "other",
             "features": None if features is None else "other",
-            "environment": None if (how := opening.reopened(env)) == "named" else how,
+            "environment": None if how == "named" else how,
             "schedule": "other" if callable(schedule) else schedule,
             "query": "other" if callable(query) else query,
             "noise_free": None if own_policy is None or has_mode(own_policy) else False,

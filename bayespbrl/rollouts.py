@@ -23,8 +23,7 @@ from jaxtyping import Bool, Float, Int, Key, Shaped
 
 from bayespbrl.checks import whole
 from bayespbrl.envs import functional
-from bayespbrl.envs.functional import FunctionalEnv
-from bayespbrl.envs.opening import AnyEnvironment, environment_name, open_environment, plainly_wrapped
+from bayespbrl.envs.opening import AnyEnvironment, environment_name, open_environment, pure_functions
 from bayespbrl.envs.stepping import check_observed, episodes_by_interface, outside_of, step_limit
 from bayespbrl.policies.batch import sample_rows
 from bayespbrl.policies.policy import AnyArray, Sampler, is_pytree
@@ -142,12 +141,11 @@ def _checked_step_limit(env: gymnasium.Env, policy: object, key: object, episode
 
 
 def _pure_dynamics(env: gymnasium.Env, policy: Sampler) -> FuncEnv | None:
-    """The pure functions; None where a wrapper or subclass, such as a user's, may change the environment."""
-    inner = env.unwrapped
-    if not (isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and plainly_wrapped(env) and is_pytree(policy)):
-        return None
-    functional.check(inner.dynamics, environment_name(env))
-    return inner.dynamics
+    """The pure functions of the environment; None where it has others, or the policy cannot be compiled with them."""
+    dynamics = pure_functions(env) if is_pytree(policy) else None
+    if dynamics is not None:
+        functional.check(dynamics, environment_name(env))
+    return dynamics
 
 
 def _check_run(

@@ -14,7 +14,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, On
 from gymnasium.utils.env_checker import check_env
 from matplotlib.figure import Figure
 from PIL import Image
-from toys import QUICK, Odd, Push
+from toys import QUICK, Echo, Odd, Push
 
 import bayespbrl
 from bayespbrl import envs
@@ -384,17 +384,7 @@ def test_discrete_observations_of_continuous_actions_are_one_hot_whatever_the_dy
 
 
 def test_a_smooth_utility_of_too_many_states_is_refused_before_anybody_is_asked():
-    class Many(gymnasium.Env):
-        observation_space, action_space = gymnasium.spaces.Discrete(1500), gymnasium.spaces.Discrete(2)
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return 0, {}
-
-        def step(self, action):
-            return int(action), 0.0, False, False, {}
-
     options = {"max_steps": 5, "answers": 2, "diffusion_utility": True}
     with pytest.raises(ValueError, match="diffusion_utility: expected at most 1000 states, got 1500"):
-        bayespbrl.Learner(Many(), **options)
-    bayespbrl.Learner(Many(), features=lambda states: np.eye(2)[np.minimum(states, 1)], **options)
+        bayespbrl.Learner(Echo(states=1500), **options)
+    bayespbrl.Learner(Echo(states=1500), features=lambda states: np.eye(2)[np.minimum(states, 1)], **options)

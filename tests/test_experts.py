@@ -2,10 +2,9 @@
 
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import pytest
-from toys import QUICK, Memory
+from toys import QUICK, Echo, Memory
 
 import bayespbrl
 from bayespbrl.experts import (
@@ -266,22 +265,9 @@ def test_a_run_finds_the_expert_that_its_settings_name_in_units_of_its_task():
     assert expert_of(learner) == expert  # continued, it is the same
 
 
-class Cents(gymnasium.Env):
-    """Each step costs a cent, whatever is done."""
-
-    observation_space, action_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return 0, {}
-
-    def step(self, action):
-        return int(action), -0.01, False, False, {}
-
-
 @pytest.mark.parametrize("name", ["stochastic", "skipping", "equal", "margin"])
 def test_returns_that_are_equal_but_for_rounding_have_no_unit(name):
-    learner = bayespbrl.Learner(Cents(), expert=name, max_steps=200, preset="paper", seed=3)
+    learner = bayespbrl.Learner(Echo(reward=-0.01), expert=name, max_steps=200, preset="paper", seed=3)
     with pytest.raises(ValueError, match=f"expert: expected returns that differ for {name}, got -2 in all 100"):
         expert_of(learner)
 

@@ -77,6 +77,22 @@ class Odd(gymnasium.Env):
         return self.np_random.uniform(-1, 1, self.observation_space.shape).astype(np.float32)
 
 
+class Echo(gymnasium.Env):
+    """Observes the last action, as one of many states, and has the same reward in each step."""
+
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, states=2, reward=0.0):
+        self.observation_space, self.reward = gymnasium.spaces.Discrete(states), reward
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return int(action), self.reward, False, False, {}
+
+
 class Push(gymnasium.Env):
     """The return is the sum of the actions; observations are the share of the steps; cut off or ended after them."""
 

@@ -114,17 +114,12 @@ def reopened(environment: object) -> str:
     """
     if isinstance(environment, str):
         return "named"
-    given = as_given(environment) if isinstance(environment, gymnasium.Env) else environment
-    if not given_by_name(given) or (isinstance(given, gymnasium.Env) and _changed(given)):
+    if not isinstance(environment, gymnasium.Env):
+        return "named" if given_by_name(environment) else "other"
+    given = as_given(environment)
+    if not given_by_name(given) or _changed(given):
         return "other"
-    stepped = isinstance(environment, gymnasium.Env) and made_from(environment) is None and not _compiled(environment)
-    return "object" if stepped else "named"
-
-
-def _compiled(env: gymnasium.Env) -> bool:
-    """Whether pure functions are all that there is to an environment, so that they run, and nothing is stepped."""
-    inner = env.unwrapped
-    return isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and plainly_wrapped(flattened(env))
+    return "object" if made_from(environment) is None and pure_functions(flattened(environment)) is None else "named"
 
 
 def made_again(name: str) -> gymnasium.Env:
@@ -247,6 +242,14 @@ def plainly_wrapped(env: gymnasium.Env) -> bool:
     """Whether all wrappers are those of `gymnasium.make`, which leave observations, actions and rewards alone."""
     *wrappers, _ = layers(env)
     return all(type(layer) in OF_MAKE for layer in wrappers)
+
+
+def pure_functions(env: gymnasium.Env) -> FuncEnv | None:
+    """All that an opened environment is; None where a wrapper or subclass, such as a user's, may change them."""
+    inner = env.unwrapped
+    if not (isinstance(inner, FunctionalEnv) and inner.is_its_dynamics and plainly_wrapped(env)):
+        return None
+    return inner.dynamics
 
 
 def layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:

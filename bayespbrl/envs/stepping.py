@@ -159,7 +159,7 @@ class _Silent(gymnasium.Wrapper):
         observation, reward, terminated, truncated, _ = returned
         if reward is None or np.asarray(reward).ndim:
             raise ValueError(f"expected a number as the reward, got {reward!r}")
-        self._observed(observation)
+        observation = self._observed(observation)
         self._last = observation if terminated or truncated else None
         return observation, reward, terminated, truncated, {}
 

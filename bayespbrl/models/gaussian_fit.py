@@ -15,7 +15,9 @@ from bayespbrl.models.preference_model import PreferenceModel
 from bayespbrl.models.threads import one_blas_thread
 
 NOW_AND_THEN = 0.05  # lapse rate of the Gaussian where answers without lapses contradict each other
-MORE_LAPSES, BELOW_CHANCE, MANY = (0.3, 0.55, 0.8), 10.0, 2  # nats; answers for each dimension
+# Those of which the most probable Gaussian is taken, where answers are more than these nats below coin tosses, and at
+# least so many for each dimension.
+MORE_LAPSES, BELOW_CHANCE, FOR_EACH_DIMENSION = (0.3, 0.55, 0.8), 10.0, 2
 
 
 @dataclass(frozen=True)
@@ -122,18 +124,19 @@ def _approximation(
         mixture = answers.probit_mixture().of(used)
         return expectation_propagation(loadings, mixture, prior_scale=prior_scale, widening=widening)
 
-    fit, ties = fitted(likelihood), ties_of(likelihood)
+    fit = fitted(likelihood)
     if not has_steps(likelihood):
         return fit
-    ordered = np.ones(len(loadings), dtype=bool) if ties is None else ~np.asarray(ties.indifferent)[used]
     if isinstance(likelihood, WithLapses):
         number, dimension = loadings.shape
         by_chance = -np.log(likelihood.choices) * number
-        if number < MANY * dimension or fit.log_evidence >= by_chance - BELOW_CHANCE:
+        if number < FOR_EACH_DIMENSION * dimension or fit.log_evidence >= by_chance - BELOW_CHANCE:
             return fit
         rates = [rate for rate in MORE_LAPSES if rate > likelihood.lapse_rate]
         fits = [fit, *(fitted(replace(likelihood, lapse_rate=rate)) for rate in rates)]
         return max(fits, key=lambda each: np.nan_to_num(each.log_evidence, nan=-np.inf))
+    ties = ties_of(likelihood)
+    ordered = np.ones(len(loadings), dtype=bool) if ties is None else ~np.asarray(ties.indifferent)[used]
     if np.all(loadings[ordered] @ fit.mean >= 0):
         return fit
     return replace(fitted(WithLapses(likelihood, NOW_AND_THEN)), log_evidence=fit.log_evidence)

@@ -27,14 +27,9 @@ SAME_MARGINS = 1e-6  # relative to the largest: rounding on one machine, in anot
 
 def settings_of(differences: ArrayLike) -> Float[np.ndarray, "s k d"]:
     """Differences (K, D) or (C, K, D) as (C, K, D), checked."""
-    try:
-        array = np.empty(0) if np.iscomplexobj(differences) else np.asarray(differences, dtype=np.float64)
-    except (TypeError, ValueError):  # no numbers, or rows of different lengths
-        array = np.empty(0)
+    array = checks.reals("differences", differences)
     if array.ndim != 3:
-        array = checks.matrix("differences", differences)[None]
-    elif array.size:
-        checks.matrix("differences", np.asanyarray(differences).reshape(-1, array.shape[2]))  # masked
+        array = checks.matrix("differences", array)[None]
     checks.finite("differences", array)
     if not array.shape[0] or not array.shape[2]:
         raise ValueError(f"differences: expected shape (K, D >= 1) or (C, K, D), got {np.shape(differences)}")

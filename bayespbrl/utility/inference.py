@@ -150,8 +150,8 @@ def infer_utility(
         units = ranges(sums)
         chosen, sums = OwnFeatures(chosen, tuple(units.tolist())), sums / units
     model = PreferenceModel(prior_scale, steepness, lapse_rate, likelihood, tie_threshold)
-    model.check_threshold(1.0)  # of normalised differences
     if method == "linear-program":
+        model.check_threshold(1.0)  # as `posterior_draws` does, of differences that are normalised
         return _by_linear_program(sums, comparisons, chosen)
     unscaled = bandwidth_multiples(chosen, inferred=False, rng=np.random.default_rng(0))
     return _by_posterior([sums], unscaled, comparisons, chosen, method, model, seed)
