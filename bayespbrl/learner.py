@@ -143,7 +143,7 @@ class Learner:
     def worth_asking(self) -> float | None:
         """What the answer to the best question of the last iteration was expected to tell, in bits: at most one.
 
-        Near zero, more answers would change little. Ties are left out of account, except with `informative_ties` while
+        Near zero, this answer would change little. Ties are left out of account, except with `informative_ties` while
         all answers are (at most log₂ 3). None before an estimate, without a posterior, and with no answer left.
         """
         return None if self.state.information is None else self.state.information / np.log(2)

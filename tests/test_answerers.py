@@ -581,6 +581,7 @@ def test_the_figures_of_each_person_come_from_a_file_too(tmp_path):
         ("1,0,1,first,,", "line 3: question: expected another number in each line, got 1 twice"),
         ("2,0,1,first,7,", "line 3: repeats: expected the number of a question above, got 7"),
         ("2,0,1,first,2,", "line 3: repeats: expected the number of a question above, got 2"),
+        ("2,2,3,first,1,", "line 3: repeats: expected a question about the same two, got 1, about others"),
         ("2,0,1,first,,soon", "line 3: seconds: expected a number >= 0, got 'soon'"),
         ("2,0,1,first,,inf", "line 3: seconds: expected a number >= 0, got 'inf'"),
         ("x,0,1,first,,", "line 3: question: expected a whole number >= 0, got 'x'"),

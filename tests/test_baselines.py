@@ -222,8 +222,21 @@ def test_a_baseline_is_a_cell_of_a_study_with_a_line_for_each_answer(tmp_path, m
         with pytest.raises(ValueError, match=r"expected a run of the learner, got a trial of a baseline: see its base"):
             read(tmp_path / "tiny/gridworld/pf/seed-2985")
     file = tmp_path / "tiny/gridworld/pf/seed-2985/baseline.json"
-    file.write_text(json.dumps({"iterations": []}))
-    with pytest.raises(ValueError, match="expected the values of a baseline"):
-        read_baseline(file.parent)
+    whole = json.loads(file.read_text())
+    without_value = [entry | {"value": "much"} for entry in whole["iterations"]]
+    for damage, told in (
+        ("", "expected the values of a baseline"),
+        ("[]", "expected at least one iteration"),
+        ({"iterations": []}, "expected at least one iteration"),
+        ({"iterations": "abc"}, "expected at least one iteration"),
+        ({"iterations": [1]}, "expected answers and value in iteration 1"),
+        (whole | {"iterations": without_value}, "expected answers and value in iteration 1"),
+        ({"iterations": whole["iterations"]}, "expected seed, env and utility"),
+        (whole | {"iterations": [whole["iterations"][0] | {"seconds": None}]}, "expected a number as seconds_utility"),
+    ):
+        file.write_text(damage if isinstance(damage, str) else json.dumps(damage))
+        with pytest.raises(ValueError, match=told):
+            read_baseline(file.parent)
+        assert list(Study.prepare(parsed(DECLARATION, "tiny"), tmp_path / "tiny").rows[0].damaged) == [2985]
     with pytest.raises(ValueError, match=r"methods\.pf, baseline: expected one of pf, epmc"):
         parsed(DECLARATION.replace('baseline = "pf"', 'baseline = "dqn"'), "tiny")

@@ -135,6 +135,12 @@ def test_a_policy_is_started_anew_once_and_what_was_kept_is_remembered():
             replay(START, history)
 
 
+def test_a_number_that_no_float_holds_is_refused():
+    fields = {"check": None, "kept": 2, "bound": {"kl_bound": 1.0, "reason": ""}, "value": 10**400}
+    with pytest.raises(ValueError, match="expected a complete event"):
+        replay(START, (*HISTORY[:-1], Entry({**HISTORY[-1].event, **fields}, HISTORY[-1].parts)))
+
+
 @pytest.mark.parametrize(
     ("history", "follows"),
     [

@@ -198,6 +198,26 @@ def test_the_second_half_of_a_double_click_or_key_is_no_answer_to_the_next_quest
         assert answers_of(gridworld) == ["first", "tie"]
 
 
+@pytest.mark.parametrize("pressed", ["[data-answer=second]", ".bp-again", ".bp-scrub"])
+def test_after_a_click_the_space_bar_pauses_and_presses_no_button(browser, gridworld, pressed):
+    with tab(browser, gridworld) as opened:
+        opened.wait_for_selector(READY)
+        # the second click of a double one, which is no answer, but leaves the focus where it was
+        opened.evaluate(
+            """name => {
+              const pressed = document.querySelector(name);
+              pressed.focus();
+              pressed.dispatchEvent(new MouseEvent("click", {bubbles: true, detail: 2}));
+            }""",
+            pressed,
+        )
+        playing = opened.get_attribute(".bp-play", "data-playing")
+        opened.keyboard.press(" ")
+        assert opened.get_attribute(".bp-play", "data-playing") != playing
+        assert opened.is_visible(READY)
+        assert answers_of(gridworld) == []
+
+
 def test_after_the_mouse_has_moved_the_clips_keys_answer_and_the_next_clips_play(browser, gridworld):
     with tab(browser, gridworld) as opened:
         opened.click(".bp-scrub")

@@ -400,8 +400,8 @@ def test_a_level_may_be_called_none(made):
 
 
 DAMAGE = {
-    "study.json": ["", "[]", "[" * 100_000],
-    "study.toml": ["tasks = ", "[tasks.gridworld"],
+    "study.json": ["", "[]", "[" * 100_000, '{"earlier": null}', '{"earlier": [1]}'],
+    "study.toml": ["tasks = ", "[tasks.gridworld", "title = " + "[" * 7000],
     "iterations.csv": ["", "seed,value\n1,2", "\0\0\0"],
     "answers.csv": ["", "seed\n1"],
 }
@@ -440,7 +440,7 @@ def told_of(made, file, change):
 def test_a_damaged_line_is_no_answer(made):
     """One bad cell makes texts of a column of true and false, and each text is true."""
     columns = ["tasks", "methods", "noise", "variants", "seed", "question", "iteration", "predicted", "first"]
-    kept = f"{','.join(columns)}\nt,first,,,2,3,2,0.4,True\nt,first,,,2,4,3,,False\n"
+    kept = f"{','.join(columns)}\nt,first,,,2,3,2,0.4,True\nt,first,,,2,4,3,0.3,False\n"
     (made / "answers.csv").write_text(kept)
     read_study(made)
 
@@ -456,7 +456,9 @@ def test_a_damaged_line_is_no_answer(made):
         ("first", "", "expected True or False as first"),
         ("predicted", "1.7", "expected probabilities as predicted, got 1.7"),
         ("predicted", "-0.5", "expected probabilities as predicted, got -0.5"),
+        ("predicted", "", "expected a number as predicted in each line, got none in 1 line"),
         ("seed", "", "expected a number as seed in each line, got none in 1 line"),
+        ("seed", "inf", "expected a number as seed in each line, got none in 1 line"),
     ):
         assert told in told_of(made, "answers.csv", with_cell(columns.index(column), text))
         (made / "answers.csv").write_text(kept)
@@ -464,9 +466,17 @@ def test_a_damaged_line_is_no_answer(made):
         made, "answers.csv", lambda lines: lines.append(lines[1])
     )
     (made / "answers.csv").write_text(kept)
+    whole = (made / "iterations.csv").read_text()
     assert "expected one line for each iteration, got two" in told_of(
         made, "iterations.csv", lambda lines: lines.append(lines[1])
     )
+    columns = whole.splitlines()[0].split(",")
+    for column, text, told in (
+        *((name, "x", f"expected numbers as {name}") for name in ("value_newest", "rhat", "kl", "seconds", "signal")),
+        ("answers", "", "expected a number as answers"),
+    ):
+        (made / "iterations.csv").write_text(whole)
+        assert told in told_of(made, "iterations.csv", with_cell(columns.index(column), text))
 
 
 RUN = """

@@ -165,7 +165,7 @@ def test_what_is_said_of_a_question_is_how_sure_the_answer_is_and_what_it_is_wor
     said, order = said_of(query, LearnerState(*NO_POLICIES, estimate=Known(*draws)))
     np.testing.assert_allclose([said["sure"], said["worth"]], [sure, worth], atol=1e-4)
     assert order[0] == likely
-    stop = "That is less than 0.01 bit: further answers change little, and you can stop here."
+    stop = "That is less than 0.01 bit: it changes little. If the next are worth no more, you can stop."
     assert said["advice"] == (stop if worth < LITTLE else "")
 
 
@@ -194,7 +194,7 @@ def test_a_person_may_stop_from_the_least_worth_on_and_not_before(monkeypatch):
     worth = said_of(query, state)[0]["worth"]
     for little, stops in ((worth * 1.001, True), (worth * 0.999, False)):
         monkeypatch.setattr("bayespbrl.people.views.LITTLE", little)
-        assert ("you can stop here" in said_of(query, state)[0]["advice"]) == stops
+        assert ("you can stop" in said_of(query, state)[0]["advice"]) == stops
     assert said_of(query, LearnerState(*NO_POLICIES))[0] == {"worth": None, "sure": None, "advice": ""}
 
 

@@ -145,6 +145,32 @@ def test_a_damaged_trial_is_given_up_and_the_others_go_on(finished, tmp_path, mo
     assert len(read_study(copy).rows) == 3
 
 
+@pytest.mark.parametrize(
+    ("damaged", "told"),
+    [
+        (lambda summary: summary["iterations"][0].update(value=None), "expected answers and value in iteration 1"),
+        (lambda summary: summary.pop("env"), "expected seed, env and utility of a run"),
+        (
+            lambda summary: summary["iterations"][0].pop("seconds"),
+            "expected a number as seconds_utility in iteration 1",
+        ),
+        (lambda summary: summary["iterations"][0].update(kl="x"), "expected a number as kl in iteration 1, got x"),
+    ],
+)
+def test_a_damaged_summary_takes_nothing_from_the_tables_of_others(finished, tmp_path, monkeypatch, damaged, told):
+    without_processes(monkeypatch)
+    copy = shutil.copytree(finished, tmp_path / "study")
+    (copy / "iterations.csv").unlink()
+    file = copy / "gridworld/linear-program/none/seed-2980/summary.json"
+    damaged(summary := json.loads(file.read_text()))
+    file.write_text(json.dumps(summary))
+    study = Study.prepare(parsed(DECLARATION, "tiny"), copy)
+    (failure,) = study.run()
+    assert "linear-program/none seed 2980" in str(failure)
+    assert told in str(failure)
+    assert sum(len(row.seeds) for row in read_study(copy).rows) == 5
+
+
 def test_a_damaged_measurement_is_given_up_and_the_others_go_on(finished, tmp_path, monkeypatch):
     without_processes(monkeypatch)
     copy = shutil.copytree(finished, tmp_path / "study")

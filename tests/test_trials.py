@@ -23,8 +23,9 @@ from bayespbrl import ReturnExpert, load, resume, start
 from bayespbrl.rollouts import returns
 from bayespbrl.studies import Trials, rows, run_trials
 from bayespbrl.studies import trials as trials_module
-from bayespbrl.studies.tables import COLUMNS, collect, collect_first_policies, write_tables
+from bayespbrl.studies.tables import COLUMNS, SECONDS, collect, collect_first_policies, survival, write_tables
 
+PARTS = ("utility", "improvement", "evaluation")
 QUICK = SHORT | {"utility": "linear-program", "iterations": 2}
 
 
@@ -108,7 +109,7 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
                 "scale": None if i == 1 else 0.5,
                 "spread": [i, 10.0 * seed],
                 "kind": "x",
-                "seconds": {"utility": 0.1 * i, "kind": "y"},
+                "seconds": {"utility": 0.1 * i, "improvement": 1.0, "evaluation": 2.0, "kind": "y"},
                 "chosen": None if i == 1 else {"multiples": [1.0, 2.0, i]},
             }
             for i in (1, 2, 3)
@@ -117,7 +118,7 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
         (tmp_path / str(seed)).mkdir()
         (tmp_path / str(seed) / "summary.json").write_text(json.dumps(summary))
     table = collect([tmp_path / "1", tmp_path / "2"])
-    assert set(table.data_vars) == {"answers", "value", "scale", "spread", "seconds_utility", "chosen_multiples"}
+    assert set(table.data_vars) == {"answers", "value", "scale", "spread", *SECONDS, "chosen_multiples"}
     np.testing.assert_allclose(table["seconds_utility"], 2 * [[0.1, 0.2, 0.3]])
     assert table["chosen_multiples"].sel(seed=1, iteration=3).values.tolist() == [1, 2, 3]
     assert table["chosen_multiples"].sel(seed=1, iteration=1).isnull().all()
@@ -130,7 +131,7 @@ def test_summaries_become_arrays_lists_with_a_dimension_of_their_own_and_none_as
 def test_a_run_that_ends_earlier_keeps_its_last_figures(tmp_path):
     for seed, length in ((1, 3), (2, 1)):
         rows = [
-            {"iteration": i, "answers": i, "value": 10.0 * seed + i, "seconds": {"utility": 1.0}}
+            {"iteration": i, "answers": i, "value": 10.0 * seed + i, "seconds": dict.fromkeys(PARTS, 1.0)}
             for i in range(1, length + 1)
         ]
         summary = {"env": "e", "utility": "u", "seed": seed, "finished": True, "iterations": rows}
@@ -332,6 +333,37 @@ def test_only_the_acrobot_needs_a_preference_and_within_three_iterations(tmp_pat
     names = ("acrobot", "bayespbrl/Acrobot-v0", "gridworld", "CartPole-v1")
     made = [rows.row_of(env, tmp_path, {}, seed=1000) for env in names]
     assert [row.preference_within for row in made] == [3, 3, None, None]
+
+
+def test_a_trial_stopped_while_it_computes_is_redrawn_as_one_that_was_not(tmp_path, monkeypatch):
+    """Whether an order came in time is looked at when the iteration is complete, however often the process died."""
+    answered = []
+    monkeypatch.setattr(
+        rows, "expert_of", lambda learner: lambda *shown: answered.append(shown) or answers[len(answered)]
+    )
+    answers = {number: "tie" if number <= 4 else "first" for number in range(1, 20)}  # two, one, one, and then an order
+    options = QUICK | {"iterations": 6, "evaluation_episodes": 2}
+    row = rows.row_of("gridworld", tmp_path, options, seed=10, preference_within=3)
+    assert rows.run_trial(row, 10) is False
+    run = row.path(10)
+    lines = (run / "events.jsonl").read_text().splitlines(keepends=True)
+    last = max(number for number, line in enumerate(lines) if json.loads(line)["event"] == "answered")
+    (run / "events.jsonl").write_text("".join(lines[: last + 1]))  # as if killed in the third iteration
+    (run / "summary.json").unlink()
+    assert row.outcome(10) is None
+    assert rows.run_trial(row, 10) is False
+    assert row.outcome(10) is False
+    assert len(answered) == 4
+
+
+def test_survival_is_of_the_policy_whose_value_is_told():
+    ended = np.array([[0.9, 0.1, 0.6], [0.8, 0.4, 0.2]])
+    kept = np.array([[1, 2, 2], [1, 2, np.nan]])  # an earlier version did not say
+    names = ("seed", "iteration")
+    table = xr.Dataset({"terminated": (names, ended)}, {"seed": [1, 2], "iteration": [1, 2, 3]})
+    np.testing.assert_allclose(survival(table), 1 - ended)
+    told = survival(table.assign(kept=(names, kept)))
+    np.testing.assert_allclose(told, [[0.1, 0.9, 0.9], [0.2, 0.6, 0.8]])
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from bayespbrl.runs.files import write_file
 from bayespbrl.runs.film import film_policy
 from bayespbrl.runs.simulated import expert_of
 from bayespbrl.studies import Trials
-from bayespbrl.studies.tables import took_place
+from bayespbrl.studies.tables import survival, took_place
 from bayespbrl.trajectories import Trajectory
 
 console = Console(soft_wrap=True, markup=False, emoji=False)  # a path may contain square brackets
@@ -260,7 +260,7 @@ def show_trials(study: Trials, max_steps: int | None = None) -> None:
         seeds = table.attrs["redrawn_seeds"].replace(" ", ", ")
         console.print(f"Trials redrawn because they met no preference: {table.attrs['redraws']}, seeds {seeds}.")
     if "balancing_steps" in table:
-        _print_balancing(1 - table["terminated"].isel(iteration=-1), table["balancing_steps"])
+        _print_balancing(survival(table).isel(iteration=-1), table["balancing_steps"])
     _print_numerics(table)
     console.print(f"Tables: {study.path / 'trials.csv'}, {study.path / 'trials.nc'}")
     picture = study.path / "trials.png"

@@ -51,7 +51,7 @@ def replay(state: LearnerState, entries: Iterable[Entry]) -> LearnerState:
     for entry in entries:
         try:
             state = apply(state, entry)
-        except (KeyError, TypeError, IndexError, AttributeError) as error:
+        except (KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
             reason = f"{type(error).__name__} {error}"
             raise ValueError(f"event: expected a complete event, got {dict(entry.event)} ({reason})") from error
     return state

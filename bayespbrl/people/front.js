@@ -286,7 +286,8 @@ function render({ model, el }) {
       if (gone) take();
       gone = false;
     }
-    if (message.refused === undefined || message.refused !== answered) return;
+    if (message.refused === undefined) return;
+    if (message.refused !== answered) return warn(message.say); // of an earlier turn, sent again
     answered = null;
     clearTimeout(slow);
     take().finally(() => warn(message.say));
@@ -295,7 +296,8 @@ function render({ model, el }) {
   function key(event) {
     const { target } = event;
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const moves = target.matches?.("input, select") && !["t", "T", "s", "S", "u", "U"].includes(event.key);
+    const still = target.matches?.("input") ? " tTsSuU" : "tTsSuU"; // the space bar opens a menu, and moves no slider
+    const moves = target.matches?.("input, select") && !still.includes(event.key);
     const presses = target.matches?.("button") && [" ", "Enter"].includes(event.key);
     if (moves || presses) return event.stopPropagation();
     if (event.key !== " " && !(event.key in KEYS)) return;
@@ -312,6 +314,7 @@ function render({ model, el }) {
   root.addEventListener("click", ({ target, detail }) => {
     const button = target.closest("[data-answer]");
     if (button && detail < 2) answer(button.dataset.answer);
+    if (detail && target.closest("button")) box.focus({ preventScroll: true }); // the space bar pauses, and presses no button
   });
   film.button.addEventListener("click", () => film.play(!film.playing));
   find(".bp-again").addEventListener("click", () => film.clips.length && film.again());

@@ -20,7 +20,7 @@ from bayespbrl.settings import MOST_UNASKED
 View = Mapping[str, Any]
 INSTRUCTIONS, THINKING, QUESTION, FINISHED, FAILED = "instructions", "thinking", "question", "finished", "failed"
 WAITING = "waiting"  # the questions that are left lie with others
-# An answer that is expected to tell less changes little: then the page says that a person may stop.
+# An answer that is expected to tell less changes little: then the page says so.
 LITTLE = questions.LEAST_INFORMATION / np.log(2)  # bits
 BREAK = 20  # answers of a sitting between two reminders that a person may pause
 
@@ -90,7 +90,7 @@ def said_of(query: Query, state: LearnerState, answerer: str | None = None) -> t
             said |= {"sure": float(chances.max()), "most": np.log2(3)}
         if said["worth"] < LITTLE:
             said["advice"] = (
-                f"That is less than {LITTLE:.2f} bit: further answers change little, and you can stop here."
+                f"That is less than {LITTLE:.2f} bit: it changes little. If the next are worth no more, you can stop."
             )
         likely = UNKNOWN if first >= 0.5 else (Answer.SECOND, Answer.FIRST, *UNKNOWN[2:])
         likely = with_ties(likely, margins, likelihood, thresholds)

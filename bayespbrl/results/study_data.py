@@ -14,11 +14,12 @@ import pandas as pd
 from bayespbrl import checks
 from bayespbrl.settings import MOST_TRAJECTORIES, settings_for
 from bayespbrl.studies.declaration import AXES, Declaration, DeclaredRow, parsed
-from bayespbrl.studies.study import FIGURES, read_study_json
-from bayespbrl.studies.tables import by_answers
+from bayespbrl.studies.study import read_study_json
+from bayespbrl.studies.tables import FIGURES, by_answers
 
 ITERATION_COLUMNS = [*AXES, "seed", "iteration", *FIGURES]
 ANSWER_COLUMNS = [*AXES, "seed", "question", "iteration", "predicted", "first"]
+IN_EACH_LINE = ("seed", "question", "iteration", "answers", "predicted")  # a trial without a value has failed
 # Options that need what the default derives from the task; without it, values that allow whatever a study ran with.
 WITHOUT_TASK = {"trajectories_per_iteration": MOST_TRAJECTORIES, "against_kept": False}
 
@@ -151,7 +152,9 @@ def read_study(directory: Path | str) -> StudyData:
     """
     directory = Path(directory)
     description = read_study_json(directory)
-    declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
+    declaration = parsed(
+        (directory / "study.toml").read_text(encoding="utf-8"), str(description.get("study", directory.name))
+    )
     if not (table := directory / "iterations.csv").exists():
         raise ValueError(f"{directory}: expected finished trials, got none: there is no iterations.csv yet")
     lines = _read(table, ITERATION_COLUMNS)
@@ -185,21 +188,20 @@ def _read(file: Path, columns: list[str]) -> pd.DataFrame:
 
 def _check(file: Path, table: pd.DataFrame) -> None:
     """Check the figures of a table by their kind; `ValueError` where a line was damaged."""
-    for name in ("seed", "question", "iteration", "answers", "value", "predicted"):
-        if name in table and not pd.api.types.is_numeric_dtype(table[name]):
+    for name in (*IN_EACH_LINE, *FIGURES):
+        if name in table and name != "converged" and not pd.api.types.is_numeric_dtype(table[name]):
             raise ValueError(f"{file}: expected numbers as {name}, got {table[name].dtype}")
-    numbers = ["seed", "question" if "question" in table else "iteration"]
-    key = [*AXES, *numbers]
-    for name in numbers:
-        if gaps := int(table[name].isna().sum()):
+    for name in IN_EACH_LINE:
+        if name in table and (gaps := int((~np.isfinite(table[name].astype(float))).sum())):
             raise ValueError(f"{file}: expected a number as {name} in each line, got none in {gaps} lines")
+    key = [*AXES, "seed", "question" if "question" in table else "iteration"]
     if (again := table.duplicated(key)).any():
         line = table[again].iloc[0]
         told = ", ".join(f"{name} {line[name]}" for name in key if line[name] != "")
         raise ValueError(f"{file}: expected one line for each {key[-1]}, got two for {told}")
     if "first" in table and table["first"].dtype != bool:
         raise ValueError(f"{file}: expected True or False as first in each line, got others")
-    if "predicted" in table and len(bad := table["predicted"][~table["predicted"].fillna(0).between(0, 1)]):
+    if "predicted" in table and len(bad := table["predicted"][~table["predicted"].between(0, 1)]):
         raise ValueError(f"{file}: expected probabilities as predicted, got {bad.iloc[0]:g}")
 
 

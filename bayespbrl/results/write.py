@@ -77,7 +77,9 @@ def refreshed(directory: Path, out: Path, *, import_package: bool = False) -> tu
     """
     unread = []
     description = read_study_json(directory)
-    declaration = parsed((directory / "study.toml").read_text(), str(description.get("study", directory.name)))
+    declaration = parsed(
+        (directory / "study.toml").read_text(encoding="utf-8"), str(description.get("study", directory.name))
+    )
     ours = description.get("version") == version("bayespbrl")
     if ours and any((directory / row.name).is_dir() for row in declaration.rows):
         for row in () if import_package else declaration.rows:

@@ -91,7 +91,7 @@ def read_questions(file: Path | str) -> tuple[PastQuestion, ...]:
         `second`.
 
     Raises:
-      ValueError: as `read_answers`; a question that is there twice, or repeats one that is not above it.
+      ValueError: as `read_answers`; a question that is there twice, or repeats one that is not above it, or of others.
     """
     past: dict[int, PastQuestion] = {}
 
@@ -106,6 +106,8 @@ def read_questions(file: Path | str) -> tuple[PastQuestion, ...]:
                 raise ValueError(f"question: expected another number in each line, got {asked} twice")
             if repeats is not None and repeats not in past:
                 raise ValueError(f"repeats: expected the number of a question above, got {repeats}")
+            if repeats is not None and {first, second} != {past[repeats].first, past[repeats].second}:
+                raise ValueError(f"repeats: expected a question about the same two, got {repeats}, about others")
         except ValueError as error:
             raise ValueError(f"line {number}: {error}") from None
         shown = (asked, first, second, second, repeats, answer, name or None, seconds)

@@ -7,9 +7,10 @@ from typing import Any
 
 from bayespbrl.baselines import BASELINES
 from bayespbrl.learner import Learner
-from bayespbrl.runs.directory import BASELINE_FILE
+from bayespbrl.runs.directory import BASELINE_FILE, checked_summary
 from bayespbrl.runs.files import write_file
 from bayespbrl.runs.simulated import expert_of
+from bayespbrl.studies.tables import checked_figures
 
 
 def measure_baseline(learner: Learner, name: str, directory: Path) -> None:
@@ -61,9 +62,7 @@ def read_baseline(directory: Path | str) -> dict[str, Any]:
     """
     file = Path(directory) / BASELINE_FILE
     try:
-        content: dict[str, Any] = json.loads(file.read_text())
-        if not content["iterations"]:
-            raise KeyError("iterations")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        content = json.loads(file.read_text())
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{file}: expected the values of a baseline, got {error}") from error
-    return content
+    return checked_figures(checked_summary(content, file), file)

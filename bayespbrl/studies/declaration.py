@@ -121,13 +121,13 @@ def declared(name_or_file: str) -> Declaration:
       ValueError: an unknown name; a file that cannot be read; a declaration that is none.
     """
     if name_or_file in shipped():
-        text = (files("bayespbrl.studies") / "declared" / f"{name_or_file}.toml").read_text()
+        text = (files("bayespbrl.studies") / "declared" / f"{name_or_file}.toml").read_text(encoding="utf-8")
         return parsed(text, name_or_file)
     file = Path(name_or_file)
     if file.suffix != ".toml":
         raise ValueError(f"study: expected one of {', '.join(shipped())}, or a TOML file, got {name_or_file!r}")
     try:
-        return parsed(file.read_text(), file.stem)
+        return parsed(file.read_text(encoding="utf-8"), file.stem)
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"study {name_or_file}: expected a readable file, got {error}") from error
 
@@ -141,7 +141,7 @@ def parsed(text: str, name: str) -> Declaration:
     where = f"study {name}"
     try:
         content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ValueError(f"{where}: expected TOML, got {error}") from error
     _known(where, content, OWN)
     axes = [_axis(where, axis, content) for axis in AXES]

@@ -1,7 +1,7 @@
 """One row of a study: a task with one choice of options, its trials, and which seeds they have."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from bayespbrl.studies.tables import (
     measure_first_policy,
     read_balancing,
     read_first_policy,
+    read_trial,
 )
 
 # A trial is redrawn if it meets no preference within this many iterations: an early acrobot's trajectories may all time
@@ -83,6 +84,7 @@ class Row:
         try:
             kept = RunDirectory.open(path)
             done = read_summary(path)["iterations"] if (path / "summary.json").exists() else []
+            finished = kept.finished()
         except ValueError as error:
             raise DamagedTrial(str(error)) from error
         if not isinstance(done, list) or any(not isinstance(entry, dict) or "pairs" not in entry for entry in done):
@@ -93,19 +95,20 @@ class Row:
             return True if self._measured(path) else None
         if done and self.redraws(len(done), done[-1]["pairs"]):
             return False
-        return True if self._measured(path) and kept.finished() else None
+        return True if finished and self._measured(path) else None
 
     def _measured(self, path: Path) -> bool:
-        """Whether a trial has what is measured apart from the learner's iterations; `DamagedTrial` if unreadable."""
-        file, read = BALANCING_FILE, read_balancing
+        """Whether a trial has all that its tables need, each readable; `DamagedTrial` if not."""
+        needed: dict[str, Callable[[Path], Any]] = {"summary.json": read_trial}
         if self.untrained or self.baseline is not None:
-            file, read = (FIRST_POLICY_FILE, read_first_policy) if self.untrained else (BASELINE_FILE, read_baseline)
-        elif self.balancing_steps is None:
-            return True
-        if not (path / file).exists():
+            needed = {FIRST_POLICY_FILE: read_first_policy} if self.untrained else {BASELINE_FILE: read_baseline}
+        elif self.balancing_steps is not None:
+            needed[BALANCING_FILE] = read_balancing
+        if not all((path / file).exists() for file in needed):
             return False
         try:
-            read(path)
+            for read in needed.values():
+                read(path)
         except ValueError as error:
             raise DamagedTrial(str(error)) from error
         return True
@@ -232,11 +235,12 @@ def run_trial(row: Row, seed: int, *, iterations: int | None = None) -> bool:
 
 def _trained(row: Row, learner: Learner, path: Path, iterations: int | None) -> bool:
     expert = expert_of(learner)
-    while not (redraws := _redraws(row, learner)) and (questions := learner.ask()):
+    # a trial that was stopped within an iteration completes it when it is asked, and is redrawn as any other then
+    while (questions := learner.ask()) and not _redraws(row, learner):
         if iterations is not None and learner.state.iteration >= iterations:
             return False
         learner.tell([expert(*query.trajectories) for query in questions])
-    if redraws:
+    if _redraws(row, learner):
         return False
     if row.balancing_steps is not None:
         measure_balancing(learner, path, max_steps=row.balancing_steps)

@@ -29,25 +29,11 @@ from bayespbrl.studies.declaration import AXES, Declaration, parsed
 from bayespbrl.studies.engine import Engine, Failure, Progress
 from bayespbrl.studies.machine import machine, rounding, source_digest
 from bayespbrl.studies.rows import DamagedTrial, Row, Seeds, collected, row_of, seconds_of
-from bayespbrl.studies.tables import took_place
+from bayespbrl.studies.tables import FIGURES, SECONDS, took_place
 from bayespbrl.studies.trials import executor_for
 
-FIGURES = {
-    "answers": "answers",
-    "value": "value",
-    "value_newest": "value_newest",
-    "terminated": "terminated",
-    "converged": "utility_converged",
-    "rhat": "rhat_max",
-    "effective_sample_size": "effective_sample_size_min",
-    "signal": "schedule_signal",
-    "kl": "kl",
-    "kl_bound": "kl_bound",
-    "seconds": "seconds",
-}  # the columns of `iterations.csv` after the levels, the seed and the iteration, by the names in the summaries
 Trial = tuple[tuple[str, str, str, str], int]  # the levels of its row, and its seed
 WHENCE = ("source", "machine", "rounding")
-SECONDS = ("seconds_utility", "seconds_improvement", "seconds_evaluation")
 
 
 @dataclass
@@ -185,7 +171,7 @@ class Study:
         """What may change of a finished study: its declaration's title and levels, and the number of trials."""
         before = read_study_json(self.directory)
         content = before | {"title": self.declaration.title, "trials": self.trials}
-        if (self.directory / "study.toml").read_text() != self.declaration.text:
+        if (self.directory / "study.toml").read_text(encoding="utf-8") != self.declaration.text:
             write_file(self.directory / "study.toml", self.declaration.text)
         if content != before:
             write_file(self.directory / "study.json", json.dumps(content, indent=1) + "\n")
@@ -286,7 +272,7 @@ def _check_same(declaration: Declaration, directory: Path) -> None:
         raise ValueError(
             f"{directory}: expected the study {declaration.name}, got {kept.get('study')}; choose another --out"
         )
-    before = parsed((directory / "study.toml").read_text(), declaration.name)
+    before = parsed((directory / "study.toml").read_text(encoding="utf-8"), declaration.name)
     if before.seed != declaration.seed:
         raise ValueError(f"{directory}: expected its seed, {before.seed}, got {declaration.seed}; choose another --out")
     rows = _settled(declaration)
@@ -325,9 +311,10 @@ def read_study_json(directory: Path) -> dict[str, Any]:
         content = json.loads(file.read_text())
         if not (directory / "study.toml").exists():
             raise OSError("it has no study.toml")
-        tomllib.loads((directory / "study.toml").read_text())
+        tomllib.loads((directory / "study.toml").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{directory}: expected the directory of a study, got {error}") from error
-    if not isinstance(content, dict):
+    earlier = content.get("earlier", []) if isinstance(content, dict) else None
+    if not isinstance(earlier, list) or not all(isinstance(part, dict) for part in earlier):
         raise ValueError(f"{file}: expected the description of a study, got {str(content)[:60]}")
     return content

@@ -16,6 +16,21 @@ from bayespbrl.runs.directory import FIRST_POLICY_FILE, read_complete_summary
 from bayespbrl.runs.files import write_file, write_netcdf
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value", "value_newest")
+SECONDS = ("seconds_utility", "seconds_improvement", "seconds_evaluation")
+# The columns of a study's `iterations.csv` after the levels, the seed and the iteration, by the names in the summaries.
+FIGURES = {
+    "answers": "answers",
+    "value": "value",
+    "value_newest": "value_newest",
+    "terminated": "terminated",
+    "converged": "utility_converged",
+    "rhat": "rhat_max",
+    "effective_sample_size": "effective_sample_size_min",
+    "signal": "schedule_signal",
+    "kl": "kl",
+    "kl_bound": "kl_bound",
+    "seconds": "seconds",
+}
 
 BALANCING_FILE = "balancing.json"
 BALANCING_EPISODES = 100
@@ -30,7 +45,7 @@ def collect(
     Numbers are kept, and lists of numbers with a dimension of their own. Those of a nested entry have both names, as
     `seconds_utility`. Missing numbers are NaN.
     """
-    summaries = [(read or read_complete_summary)(path) for path in directories]
+    summaries = [(read or read_trial)(path) for path in directories]
     seeds = [summary["seed"] for summary in summaries]
     length = max(len(summary["iterations"]) for summary in summaries)
     iterations = list(range(1, length + 1))
@@ -48,6 +63,38 @@ def collect(
         variables["balancing_steps"] = ("seed", np.array([entry["mean_steps"] for entry in lasted]), limits)
     attributes = {"env": summaries[0]["env"], "utility": summaries[0]["utility"]}
     return xr.Dataset(variables, {"seed": seeds, "iteration": iterations}, attributes)
+
+
+def read_trial(directory: Path | str) -> dict[str, Any]:
+    """`read_complete_summary`, with the `checked_figures`."""
+    return checked_figures(read_complete_summary(directory), Path(directory) / "summary.json")
+
+
+def checked_figures(summary: dict[str, Any], file: Path) -> dict[str, Any]:
+    """The summary of a trial, with its seconds in each iteration, and numbers as all `FIGURES`.
+
+    Raises:
+      ValueError: others, which would take a line or a column from the tables of all trials.
+    """
+    for number, entry in enumerate(map(_flat, summary["iterations"]), start=1):
+        for name in (*SECONDS, *FIGURES.values()):
+            value = entry.get(name)
+            if not isinstance(value, int | float) and (value is not None or name in SECONDS):
+                raise ValueError(f"{file}: expected a number as {name} in iteration {number}, got {str(value)[:60]}")
+    return summary
+
+
+def survival(table: xr.Dataset) -> xr.DataArray:
+    """The share of evaluation episodes that survive under the policies whose values are told, (seed, iteration).
+
+    Of each iteration the summary has the newest policy's, which is not always kept.
+    """
+    lasted = 1 - table["terminated"]
+    if "kept" not in table:
+        return lasted
+    newest = np.broadcast_to(table["iteration"].values, lasted.shape)
+    kept = np.where(table["kept"].isnull(), newest, table["kept"]).astype(int)
+    return lasted.copy(data=np.take_along_axis(lasted.values, kept - 1, axis=1))
 
 
 def took_place(table: xr.Dataset) -> xr.DataArray:
@@ -153,8 +200,8 @@ def collect_first_policies(directories: Sequence[Path | str], env: str) -> xr.Da
 def write_tables(table: xr.Dataset, directory: Path) -> None:
     """Write `trials.csv`, one row per trial and iteration that it had, and `trials.nc`, each whole or not at all.
 
-    Where a balancing time was measured there are three more columns: the share of evaluation episodes that survive, and
-    the balancing time of the final policy in steps and in seconds, in the row of the last iteration.
+    Where a balancing time was measured there are three more columns: the `survival`, and the balancing time of the
+    final policy in steps and in seconds, in the row of the last iteration.
     """
     names, had = ["answers", "value", "value_newest"], took_place(table).values.ravel()
     rows = table[names].to_dataframe(["seed", "iteration"]).reset_index()[had]
@@ -162,7 +209,7 @@ def write_tables(table: xr.Dataset, directory: Path) -> None:
     if "balancing_steps" in table:
         last = ~rows.duplicated("seed", keep="last")
         steps = rows["seed"].map(table["balancing_steps"].to_series())
-        rows["survival"] = [f"{share:g}" for share in (1 - table["terminated"]).values.ravel()[had]]
+        rows["survival"] = [f"{share:g}" for share in survival(table).values.ravel()[had]]
         rows["balancing_steps"] = steps.where(last)
         rows["balancing_seconds"] = [round(number * bicycle.STEP_SECONDS, 6) for number in rows["balancing_steps"]]
     write_file(directory / "trials.csv", rows.to_csv(index=False, lineterminator="\r\n"))
