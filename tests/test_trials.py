@@ -204,6 +204,8 @@ def test_trials_of_a_task_that_no_seed_decides_share_what_was_measured(tmp_path)
         assert rows.run_trial(row, 1)
         assert load(row.path(1), env="Chance-v0").settings == row.settings
         assert [each.outcome(1) for each in (row, *again)] == [True] * 4
+        later = [rows.row_of("Chance-v0", tmp_path / "row", options, seed=1) for _ in range(3)]
+        assert {each.settings.rollouts.trajectories_per_iteration for each in later} == {measured}
     finally:
         del gymnasium.registry["Chance-v0"]
 

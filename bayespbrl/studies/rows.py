@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -152,7 +153,8 @@ def row_of(
     checks.optional(checks.whole, "preference_within", preference_within)
     environment = open_environment(env)
     identity = environment_name(environment)
-    first = settings_for(env, task=Task.of(environment, options.get("max_steps")), **options, seed=seed)
+    task = Task.of(environment, options.get("max_steps"))
+    first = settings_for(env, task=task, **_measured_before(env, directory, options), **options, seed=seed)
     environment.close()
     if first.expert not in SIMULATED:
         raise ValueError(f"expert: expected one of {', '.join(SIMULATED)}, which are simulated, got {first.expert!r}")
@@ -163,6 +165,16 @@ def row_of(
     within = PREFERENCE_WITHIN.get(identity) if preference_within is None else preference_within
     balancing = BALANCING_STEPS.get(identity)
     return Row(env, directory, first, dict(options), within, balancing, untrained, name)
+
+
+def _measured_before(env: str, directory: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """What random episodes decided for the row's trials that there are: not always the same, where no seed does."""
+    names = measured_options(env, options)
+    for path in sorted(directory.glob("seed-*")) if names else ():
+        with suppress(ValueError):
+            if (kept := RunDirectory.open(path).settings).env == env:
+                return {name: kept.options()[name] for name in names}
+    return {}
 
 
 @dataclass
