@@ -32,11 +32,12 @@ from bayespbrl.diagnostics.report import write as report_write
 from bayespbrl.diagnostics.report.answers import surprise_order
 from bayespbrl.diagnostics.report.contents import RunContents, read_contents
 from bayespbrl.diagnostics.report.formatting import number
+from bayespbrl.diagnostics.report.log import AnsweredQuestion
 from bayespbrl.diagnostics.report.warnings import find_warnings
 from bayespbrl.diagnostics.report.write import assembled, write_report
 from bayespbrl.improvement.schedules import Bound
 from bayespbrl.models.likelihoods import log_prob
-from bayespbrl.preferences import Answer
+from bayespbrl.preferences import Answer, Preferences
 from bayespbrl.runs.iteration_files import read_iteration
 from bayespbrl.trajectories import trajectory_features
 
@@ -175,7 +176,7 @@ def test_the_summary_has_the_value_and_the_convergence_of_the_posterior(page, co
 @pytest.mark.parametrize(("kept", "of"), [(1, "the earlier one of iteration 1"), (3, "the one of iteration 3")])
 def test_the_report_says_that_a_policy_was_started_anew_and_which_is_kept(contents, kept, of):
     report = assembled(changed(contents, [{}, {}, {"restarted": 2, "kept": kept}]))
-    said = f"After iteration 2 the policy was restarted with the last posterior; the run keeps {of}."
+    said = f"After iteration 2 the policy was restarted with the posterior by then; the run keeps {of}."
     assert said in report.summary
     (learning,) = [section for section in report.sections if section.name == "learning"]
     assert "begins again where the policy was restarted; the last" in str(learning.blocks)
@@ -729,6 +730,44 @@ def test_a_run_whose_questions_were_mostly_skipped_is_told_so(tmp_path, answers,
         learner.tell([answer] * len(learner.ask()))
     text = read(write_report(tmp_path / "run")).text
     assert (f"{skipped} questions were skipped: they taught nothing." in text) == bool(skipped)
+
+
+def test_a_plain_chain_says_nothing_of_ties_and_asks_for_more_draws(tmp_path):
+    options = {"utility": "posterior-mean", "plain_draws": 400, "hyperparameters": "given", "evaluation_episodes": 2}
+    learner = start(tmp_path / "run", **options)
+    for answer in ("first", "tie", "skip", "tie", "second"):
+        learner.tell([answer] * len(learner.ask()))
+    answers = report_tables.answers_table(read_contents(tmp_path / "run"))
+    tied = answers["said"].values == "tie"
+    assert np.isnan(answers["probability"].values[tied]).all()
+    assert np.isfinite(answers["probability"].values[answers["said"].values == "first"]).all()
+    text = read(write_report(tmp_path / "run")).text
+    assert "not used by the model" in text
+    assert "rank plots" not in text.lower()
+    assert "take more (--plain-draws), or leave that option out" in text
+    given = int((answers["said"].values != "skip").sum())
+    assert f"{tied.sum()} of {given} answers were ties" in text
+
+
+@pytest.mark.parametrize(("again", "better"), [(2, True), (3, False)])
+def test_what_is_undominated_says_what_it_leaves_out(contents, again, better):
+    """A repeated question does not say whom later trajectories are compared with, and may contradict."""
+    preferences = Preferences().start(1).add(2, 1, preferred=2).add(3, 2, preferred=2)
+    preferences = preferences.add_repeated(3, 2, preferred=again)
+    shown = ((1, 2, Answer.SECOND), (2, 3, Answer.FIRST), (3, 2, Answer.SECOND if again == 2 else Answer.FIRST))
+    answers = tuple(AnsweredQuestion(k + 1, 1, *each, k) for k, each in enumerate(shown))
+    (text,) = report_summary._undominated(replace(contents, preferences=preferences, answers=answers))
+    assert ("found nothing better" in text) == better
+    assert ("leaving out repeated questions" in text) == (not better)
+
+
+def test_a_policy_that_was_compared_and_is_level_has_its_gain():
+    check = {"trust": 1.0, "stepped_back": False, "gain": 0.0, "standard_error": 0.0}
+    schedule = {"gain": 0.0, "standard_error": 0.0}  # of a user's own
+    summaries = [{"check": check | {"best": best}, "schedule": schedule} for best in (0, 0, 2)]
+    table = report_tables.iterations_table(summaries)
+    np.testing.assert_array_equal(table["check gain"], [np.nan, 0, np.nan])
+    np.testing.assert_array_equal(table["schedule gain"], [0, 0, 0])
 
 
 @pytest.mark.slow

@@ -96,7 +96,8 @@ def convergence_of_fits(contents: RunContents, iterations: xr.Dataset) -> Body:
         f"Effective sample sizes of {result.sizes['preference']} margins.",
         size=(7.6, 2.8),
     )
-    return [], [every, margins, _rank_plots(contents.posterior, result)]
+    ranks = [_rank_plots(contents.posterior, result)] if contents.posterior["posterior"].sizes["chain"] > 1 else []
+    return [], [every, margins, *ranks]  # of one chain alone the ranks are level by construction
 
 
 def _rank_plots(tree: xr.DataTree, result: xr.Dataset) -> Picture:

@@ -18,7 +18,7 @@ def summary(
 ) -> list[str]:
     """The sentences, from the contents and their tables."""
     if not iterations.sizes["iteration"]:
-        given = count(len(contents.answers), "answer has", "answers have")
+        given = count(contents.preferences.answers, "answer has", "answers have")
         return [f"Nothing has been learnt yet: no iteration is completed, {given} been given."]
     sentences = [_value(contents, iterations), *_restart(contents), _convergence(contents)]
     quality = None if contents.estimate is None else contents.estimate.quality
@@ -61,8 +61,8 @@ def _restart(contents: RunContents) -> Iterator[str]:
     if contents.started and isinstance(kept, int):
         of = "the one" if kept > contents.started else "the earlier one"
         yield (
-            f"After iteration {contents.started} the policy was restarted with the last posterior; the run keeps {of} "
-            f"of iteration {kept}."
+            f"After iteration {contents.started} the policy was restarted with the posterior by then; the run keeps "
+            f"{of} of iteration {kept}."
         )
 
 
@@ -137,7 +137,8 @@ def _calibration(scores: xr.Dataset, the: str) -> str:
 
 def _undominated(contents: RunContents) -> Iterator[str]:
     """The best so far, and for how many comparisons it has been so."""
-    best = contents.preferences.undominated
+    best, pairs = contents.preferences.undominated, contents.preferences.pairs
+    lost = {dominated for _, dominated in pairs}
     compared = [answer for answer in contents.answers if answer.answer is not Answer.SKIP]
     if not best or not compared:
         return
@@ -145,5 +146,10 @@ def _undominated(contents: RunContents) -> Iterator[str]:
     named = ", ".join(f"{n} (of iteration {n // size + 1})" for n in best)
     with_it = ({answer.first, answer.second} for answer in compared if best[-1] in (answer.first, answer.second))
     since = max(0, len(set().union(*with_it)) - 2)  # itself, and the one that made it the best
-    unbeaten = f" {count(since, 'comparison')} since then found nothing better." if since else ""
-    yield f"Undominated among all compared trajectories: number {named}.{unbeaten}"
+    unbeaten = (
+        f" {count(since, 'comparison')} since then found nothing better." if since and best[-1] not in lost else ""
+    )
+    # neither says which trajectory later ones are compared with
+    whole = {preferred for preferred, _ in pairs} - lost <= set(best) and not lost & set(best)
+    apart = "" if whole else ", leaving out repeated questions and comparisons of two policies"
+    yield f"Undominated among all compared trajectories{apart}: number {named}.{unbeaten}"

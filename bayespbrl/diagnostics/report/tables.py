@@ -49,8 +49,9 @@ def iterations_table(summaries: Sequence[Summary]) -> xr.Dataset:
     columns: dict[str, list[Any]] = {name: [_number(summary.get(name)) for summary in summaries] for name in MEASURED}
     for group in ("schedule", "check", "hyperparameters"):
         rows = [_flat(summary.get(group)) for summary in summaries]
-        for row in rows:
-            if row.get("gain") == row.get("standard_error") == 0:  # no policy was compared
+        for number, row in enumerate(rows) if group == "check" else ():
+            # its own policy is the best, and by no gain: none was compared
+            if row.get("best") == number and row.get("gain") == row.get("standard_error") == 0:
                 row |= {"gain": None, "standard_error": None}
         for key in dict.fromkeys(key for row in rows for key in row):
             values = [row.get(key) for row in rows]
@@ -105,6 +106,8 @@ def _by_last_estimate(
     estimate, tree = contents.estimate, contents.posterior
     if estimate is None or answer.row is None:
         return np.nan, np.nan, np.nan
+    if tree is not None and not answer.states_order and "tie_threshold" not in tree["posterior"]:
+        return np.nan, np.nan, np.nan  # a plain chain leaves ties out
     pairs = estimate.quality.pairs  # the rows of the ties come after them
     row, rows = (
         (answer.row, pairs) if answer.states_order else (pairs + answer.row, 0 if margins is None else margins.shape[2])

@@ -37,7 +37,8 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
     if estimate.features is not None:
         table = utility_table(contents)
         blocks += _maps(table)
-        text += _remaining_uncertainty(table)
+        several = contents.posterior is not None and len(contents.posterior["utility_weights_mean"]) > 1
+        text += _remaining_uncertainty(table, several=several)
     compared = trajectories_table(contents)
     if compared.sizes["trajectory"] and np.ptp(compared["hidden_return"].values) > 0:
         blocks.append(_trajectories(compared, clips=bool(contents.clips)))
@@ -77,17 +78,18 @@ def _what_else(found: Mapping[str, Any], settings: int) -> str:
     return text
 
 
-def _remaining_uncertainty(table: xr.Dataset) -> list[str]:
+def _remaining_uncertainty(table: xr.Dataset, *, several: bool) -> list[str]:
     if "sd" not in table:
         return []
     inside = table["reached"].values & (table["prior_sd"].values > 0)
     if not inside.any():
         return []
     left = table["sd"].values[inside] / table["prior_sd"].values[inside]
+    least = f", and {percent(left.min())} where most was learnt" if left.min() < 1 else ""
+    lengths = " With it, the length scales that became probable change both." if several else ""
     return [
         f"The posterior standard deviation is {percent(np.median(left))} of the prior's in the median over the states "
-        f"shown, and {percent(left.min())} where most was learnt. Answers distinguish what was shown as a whole, and "
-        "say less about single states."
+        f"shown{least}. Answers distinguish what was shown as a whole, and say less about single states." + lengths
     ]
 
 
@@ -123,8 +125,8 @@ def _maps(table: xr.Dataset) -> list[Picture]:
         shown.append(("left", "Remaining uncertainty", "sd / prior sd", "magma"))
         caption = (
             f"The utility {where}: its posterior mean; its standard deviation, which is also small where the features "
-            "are small; and the standard deviation as a share of the prior's, dark where the answers were informative. "
-            "The scale is arbitrary."
+            "are small; and the standard deviation as a share of the prior's, dark where the answers, or the length scales "
+            "that they made probable, leave less. The scale is arbitrary."
         )
         if not np.array_equal(table["used"], table["mean"]):
             shown.append(used)

@@ -51,7 +51,9 @@ def _of_fits(contents: RunContents, table: xr.Dataset) -> Iterator[ReportWarning
         yield ReportWarning(
             f"The posterior did not converge in {_which(failed)}. {last}Uncertainties there are unreliable, and so are "
             "the policy updates that followed.",
-            "Look at the rank plots. "
+            "One chain of so many draws does not suffice: take more (--plain-draws), or leave that option out."
+            if contents.settings.estimation.plain_draws is not None
+            else "Look at the rank plots. "
             + (
                 "The usual reason is answers that contradict each other, under the lapse rate that was set. Let it be "
                 "inferred."
@@ -98,7 +100,8 @@ def _of_fitted_policy(table: xr.Dataset) -> Iterator[ReportWarning]:
     if (near := iteration[active & (fitted < reached / 3) & (reached > 0.02)]).size > 0.2 * len(iteration):
         yield ReportWarning(
             f"The fitted policy moved less than a third as far as REPS asked for in {_which(near)}.",
-            "The policy smooths the update. Harmless while the value rises. A larger bound moves it further"
+            "The policy smooths the update. Harmless while the value rises. A larger bound (--schedule constant with a "
+            "larger --kl-bound) moves it further"
             + (", and so do more updates (--updates-per-iteration 3)." if not several.any() else "."),
         )
 
@@ -164,9 +167,10 @@ def _of_undecided_answers(answers: Sequence[Answer]) -> Iterator[ReportWarning]:
             "Say what to look for, or show clips in which it can be seen: shorter ones (--clip-steps), or pictures by "
             "your environment's render().",
         )
-    if (ties := answers.count(Answer.TIE)) > 0.3 * max(3, len(answers)):
+    given = len(answers) - skipped
+    if (ties := answers.count(Answer.TIE)) > 0.3 * max(3, given):
         yield ReportWarning(
-            f"{ties} of {len(answers)} answers were ties: they say that two are alike, not what is better.",
+            f"{ties} of {given} answers were ties: they say that two are alike, not what is better.",
             "Harmless where the trajectories are good. Otherwise longer ones, or less similar ones, are easier to tell "
             "apart.",
         )

@@ -64,7 +64,7 @@ def write_report(
 
 def _rendered(report: Report, format: str) -> str:
     template = files("bayespbrl.diagnostics.report") / "templates" / f"report.{format}.jinja"
-    # names and messages of a run are text, never markup
+    # in HTML names and messages of a run are text, never markup; Markdown shows them as they are
     engine = Environment(autoescape=format == "html", undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     engine.filters["groupby_adjacent"] = lambda blocks: [
         (kind, list(group)) for kind, group in groupby(blocks, key=attrgetter("kind"))
