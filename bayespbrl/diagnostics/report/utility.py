@@ -89,7 +89,8 @@ def _remaining_uncertainty(table: xr.Dataset, *, several: bool) -> list[str]:
     lengths = " With it, the length scales that became probable change both." if several else ""
     return [
         f"The posterior standard deviation is {percent(np.median(left))} of the prior's in the median over the states "
-        f"shown{least}. Answers distinguish what was shown as a whole, and say less about single states." + lengths
+        f"shown{least}. Answers distinguish what was shown as a whole, and say less about single "
+        f"states.{lengths}"
     ]
 
 
