@@ -126,8 +126,8 @@ def _maps(table: xr.Dataset) -> list[Picture]:
         shown.append(("left", "Remaining uncertainty", "sd / prior sd", "magma"))
         caption = (
             f"The utility {where}: its posterior mean; its standard deviation, which is also small where the features "
-            "are small; and the standard deviation as a share of the prior's, dark where the answers, or the length scales "
-            "that they made probable, leave less. The scale is arbitrary."
+            "are small; and the standard deviation as a share of the prior's, dark where the answers, or the length "
+            "scales that they made probable, leave less. The scale is arbitrary."
         )
         if not np.array_equal(table["used"], table["mean"]):
             shown.append(used)
