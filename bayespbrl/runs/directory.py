@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from bayespbrl import checks
-from bayespbrl.events import Entry, LearnerState, has_figures, surviving
+from bayespbrl.events import Entry, LearnerState, surviving
 from bayespbrl.features import StateFeatures
 from bayespbrl.runs.files import check_file, check_folder, synchronise, write_file
 from bayespbrl.runs.iteration_files import read_iteration, write_iteration
@@ -300,25 +300,6 @@ def read_summary(directory: Path | str) -> dict[str, Any]:
     if not isinstance(summary, dict) or not {"seed", "finished", "iterations"} <= set(summary):
         raise ValueError(f"{file}: expected the summary of a run, got {str(summary)[:60]}")
     return summary
-
-
-def read_complete_summary(directory: Path | str) -> dict[str, Any]:
-    """`read_summary`, of a run with at least one iteration, each with its figures; `ValueError` where it has others."""
-    return checked_summary(read_summary(directory), Path(directory) / "summary.json")
-
-
-def checked_summary(summary: Any, file: Path) -> dict[str, Any]:
-    """The summary of a run, or of what is told like one, with at least one iteration, each with its figures."""
-    entries = summary.get("iterations") if isinstance(summary, dict) else None
-    if not isinstance(entries, list) or not entries:
-        raise ValueError(f"{file}: expected at least one iteration, got {str(entries)[:60]}")
-    for number, entry in enumerate(entries, start=1):
-        if not has_figures(entry):
-            raise ValueError(f"{file}: expected answers and value in iteration {number}, got {str(entry)[:60]}")
-    if type(summary.get("seed")) is not int or not isinstance(summary.get("env"), str) or "utility" not in summary:
-        figures = {name: summary.get(name) for name in ("seed", "env", "utility")}
-        raise ValueError(f"{file}: expected seed, env and utility of a run, got {str(figures)[:120]}")
-    return dict(summary)
 
 
 def command_to_continue(command: str, settings: Settings, path: Path, answerers: Sequence[str] = ()) -> str:

@@ -7,10 +7,10 @@ from typing import Any
 
 from bayespbrl.baselines import BASELINES
 from bayespbrl.learner import Learner
-from bayespbrl.runs.directory import BASELINE_FILE, checked_summary
+from bayespbrl.runs.directory import BASELINE_FILE
 from bayespbrl.runs.files import write_file
 from bayespbrl.runs.simulated import expert_of
-from bayespbrl.studies.tables import checked_figures
+from bayespbrl.studies.tables import checked_figures, checked_summary
 
 
 def measure_baseline(learner: Learner, name: str, directory: Path) -> None:

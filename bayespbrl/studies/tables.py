@@ -11,8 +11,9 @@ import xarray as xr
 
 from bayespbrl import checks, rollouts
 from bayespbrl.envs import bicycle
+from bayespbrl.events import has_figures
 from bayespbrl.learner import Learner
-from bayespbrl.runs.directory import FIRST_POLICY_FILE, read_complete_summary
+from bayespbrl.runs.directory import FIRST_POLICY_FILE, read_summary
 from bayespbrl.runs.files import write_file, write_netcdf
 
 COLUMNS = ("env", "utility", "seed", "iteration", "answers", "value", "value_newest")
@@ -66,8 +67,23 @@ def collect(
 
 
 def read_trial(directory: Path | str) -> dict[str, Any]:
-    """`read_complete_summary`, with the `checked_figures`."""
-    return checked_figures(read_complete_summary(directory), Path(directory) / "summary.json")
+    """The summary of a run with at least one iteration, each with its figures; `ValueError` where it has others."""
+    file = Path(directory) / "summary.json"
+    return checked_figures(checked_summary(read_summary(directory), file), file)
+
+
+def checked_summary(summary: Any, file: Path) -> dict[str, Any]:
+    """The summary of a run, or of what is told like one, with at least one iteration, each with its figures."""
+    entries = summary.get("iterations") if isinstance(summary, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(f"{file}: expected at least one iteration, got {str(entries)[:60]}")
+    for number, entry in enumerate(entries, start=1):
+        if not has_figures(entry):
+            raise ValueError(f"{file}: expected answers and value in iteration {number}, got {str(entry)[:60]}")
+    if type(summary.get("seed")) is not int or not isinstance(summary.get("env"), str) or "utility" not in summary:
+        figures = {name: summary.get(name) for name in ("seed", "env", "utility")}
+        raise ValueError(f"{file}: expected seed, env and utility of a run, got {str(figures)[:120]}")
+    return dict(summary)
 
 
 def checked_figures(summary: dict[str, Any], file: Path) -> dict[str, Any]:
