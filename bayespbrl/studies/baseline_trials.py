@@ -10,7 +10,7 @@ from bayespbrl.learner import Learner
 from bayespbrl.runs.directory import BASELINE_FILE
 from bayespbrl.runs.files import write_file
 from bayespbrl.runs.simulated import expert_of
-from bayespbrl.studies.tables import checked_figures, checked_summary
+from bayespbrl.studies.tables import checked_trial
 
 
 def measure_baseline(learner: Learner, name: str, directory: Path) -> None:
@@ -65,4 +65,4 @@ def read_baseline(directory: Path | str) -> dict[str, Any]:
         content = json.loads(file.read_text())
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{file}: expected the values of a baseline, got {error}") from error
-    return checked_figures(checked_summary(content, file), file)
+    return checked_trial(content, file)

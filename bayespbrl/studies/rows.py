@@ -84,10 +84,10 @@ class Row:
             return None
         try:
             kept = RunDirectory.open(path)
-            done = read_summary(path)["iterations"] if (path / "summary.json").exists() else []
-            finished = kept.finished()
+            summary = read_summary(path) if (path / "summary.json").exists() else {}
         except ValueError as error:
             raise DamagedTrial(str(error)) from error
+        done = summary.get("iterations", [])
         if not isinstance(done, list) or any(not isinstance(entry, dict) or "pairs" not in entry for entry in done):
             raise DamagedTrial(f"{path / 'summary.json'}: expected pairs in each iteration, got {str(done)[:60]}")
         if others := self._others(kept.settings, seed):
@@ -96,7 +96,7 @@ class Row:
             return True if self._measured(path) else None
         if done and self.redraws(len(done), done[-1]["pairs"]):
             return False
-        return True if finished and self._measured(path) else None
+        return True if summary.get("finished") and self._measured(path) else None
 
     def _measured(self, path: Path) -> bool:
         """Whether a trial has all that its tables need, each readable; `DamagedTrial` if not."""

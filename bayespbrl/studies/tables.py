@@ -67,37 +67,32 @@ def collect(
 
 
 def read_trial(directory: Path | str) -> dict[str, Any]:
-    """The summary of a run with at least one iteration, each with its figures; `ValueError` where it has others."""
-    file = Path(directory) / "summary.json"
-    return checked_figures(checked_summary(read_summary(directory), file), file)
+    """The summary of a run as a trial (`checked_trial`)."""
+    return checked_trial(read_summary(directory), Path(directory) / "summary.json")
 
 
-def checked_summary(summary: Any, file: Path) -> dict[str, Any]:
-    """The summary of a run, or of what is told like one, with at least one iteration, each with its figures."""
+def checked_trial(summary: Any, file: Path) -> dict[str, Any]:
+    """The summary of a trial, or of what is told like one, with at least one iteration, each with its figures.
+
+    Raises:
+      ValueError: others; seconds that are missing, or `FIGURES` that are no numbers, would take a line or a column from
+        the tables of all trials.
+    """
     entries = summary.get("iterations") if isinstance(summary, dict) else None
     if not isinstance(entries, list) or not entries:
         raise ValueError(f"{file}: expected at least one iteration, got {str(entries)[:60]}")
     for number, entry in enumerate(entries, start=1):
         if not has_figures(entry):
             raise ValueError(f"{file}: expected answers and value in iteration {number}, got {str(entry)[:60]}")
+        flat = _flat(entry)
+        for name in (*SECONDS, *FIGURES.values()):
+            value = flat.get(name)
+            if not isinstance(value, int | float) and (value is not None or name in SECONDS):
+                raise ValueError(f"{file}: expected a number as {name} in iteration {number}, got {str(value)[:60]}")
     if type(summary.get("seed")) is not int or not isinstance(summary.get("env"), str) or "utility" not in summary:
         figures = {name: summary.get(name) for name in ("seed", "env", "utility")}
         raise ValueError(f"{file}: expected seed, env and utility of a run, got {str(figures)[:120]}")
     return dict(summary)
-
-
-def checked_figures(summary: dict[str, Any], file: Path) -> dict[str, Any]:
-    """The summary of a trial, with its seconds in each iteration, and numbers as all `FIGURES`.
-
-    Raises:
-      ValueError: others, which would take a line or a column from the tables of all trials.
-    """
-    for number, entry in enumerate(map(_flat, summary["iterations"]), start=1):
-        for name in (*SECONDS, *FIGURES.values()):
-            value = entry.get(name)
-            if not isinstance(value, int | float) and (value is not None or name in SECONDS):
-                raise ValueError(f"{file}: expected a number as {name} in iteration {number}, got {str(value)[:60]}")
-    return summary
 
 
 def survival(table: xr.Dataset) -> xr.DataArray:

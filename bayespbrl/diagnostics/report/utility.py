@@ -32,13 +32,13 @@ def utility(contents: RunContents, ranking: xr.Dataset) -> Body:
         return [f"The features φ are a function of your own, and {contents.features_missing}."], []
     blocks: list[Block] = []
     text = [] if contents.posterior is not None else [contents.posterior_missing]
-    if contents.posterior is not None:
-        text.append(_what_else(estimate.hyperparameters() or {}, len(contents.posterior["utility_weights_mean"])))
+    settings = 0 if contents.posterior is None else len(contents.posterior["utility_weights_mean"])
+    if settings:
+        text.append(_what_else(estimate.hyperparameters() or {}, settings))
     if estimate.features is not None:
         table = utility_table(contents)
         blocks += _maps(table)
-        several = contents.posterior is not None and len(contents.posterior["utility_weights_mean"]) > 1
-        text += _remaining_uncertainty(table, several=several)
+        text += _remaining_uncertainty(table, several=settings > 1)
     compared = trajectories_table(contents)
     if compared.sizes["trajectory"] and np.ptp(compared["hidden_return"].values) > 0:
         blocks.append(_trajectories(compared, clips=bool(contents.clips)))
