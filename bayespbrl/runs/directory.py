@@ -163,10 +163,6 @@ class RunDirectory:
                 file.truncate(before)
                 raise
 
-    def finished(self) -> bool:
-        """Whether all iterations are completed, according to `summary.json`."""
-        return (self.path / "summary.json").exists() and bool(read_summary(self.path)["finished"])
-
     def entries(self, *, features: StateFeatures | None = None, known: Sequence[type] = ()) -> Iterator[Entry]:
         """The events so far with their heavy parts, without those undone and without a last line that is cut off.
 
