@@ -340,6 +340,18 @@ def test_features_are_dataclasses_of_arrays_and_numbers(observation_space, actio
     check(features)
 
 
+def test_many_discrete_actions_have_fewer_functions_each():
+    rng = np.random.default_rng(12)
+    states = swinging_states(400, rng)
+    for number, functions in ((2, 200), (20, 2000), (40, 2000), (250, 2500)):
+        actions = rng.integers(number, size=400)
+        options = RadialBasisOptions(100)
+        features = draw_state_action_features(STATES, Discrete(number), states, actions, options, rng=rng)
+        assert features(states[:5], actions[:5]).shape == (5, functions)
+    tables = draw_state_action_features(Discrete(30), Discrete(150), actions, actions, RadialBasisOptions(8), rng=rng)
+    assert tables.state_features.number_of_states == 30
+
+
 def test_features_of_more_states_than_a_block_are_those_of_each():
     rng = np.random.default_rng(12)
     states = swinging_states(3 * ROWS_AT_A_TIME + 7, rng)

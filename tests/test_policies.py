@@ -250,6 +250,11 @@ def test_an_integer_weight_equals_a_repeated_sample(kind):
     assert once.kl_divergence(repeated, observations).max() < tolerance
 
 
+def test_a_softmax_policy_of_many_actions_has_fewer_centres():
+    centres = [len(SoftmaxPolicy.initial(CONTINUOUS, Discrete(number)).centres) for number in (2, 20, 40, 200)]
+    assert centres == [50, 50, 25, 10]
+
+
 def test_base_weights_multiply_sample_weights(kind):
     rng = np.random.default_rng(12)
     observations = some_observations(kind, 200, rng)

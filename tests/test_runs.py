@@ -834,6 +834,35 @@ def test_an_environment_with_other_spaces_is_refused_and_a_run_that_does_not_kno
     bayespbrl.load(tmp_path / "run", env=Counted())
 
 
+def test_an_environment_made_with_other_keywords_is_refused(tmp_path):
+    def made(**keywords):
+        return gymnasium.make("Pendulum-v1", **keywords)
+
+    bayespbrl.start(made(g=3), tmp_path / "run", **QUICK)
+    bayespbrl.load(tmp_path / "run", env=made(g=3.0, render_mode="rgb_array"))
+    before = contents(tmp_path / "run")
+    for env, got in ((made(g=4), "g=4.0"), (made(), "none")):
+        for read in (bayespbrl.load, runs.resume):
+            with pytest.raises(ValueError, match=f"run: env: expected the run's keywords, g=3.0, got {got}"):
+                read(tmp_path / "run", env=env)
+    assert contents(tmp_path / "run") == before
+    runs.resume(tmp_path / "run", env=made(g=3.0))
+
+
+class Parts(Corridor):
+    """The corridor, observed as one of two parts; actions count from elsewhere."""
+
+    observation_space = gymnasium.spaces.Dict(at=gymnasium.spaces.Discrete(7), seen=gymnasium.spaces.Box(0, 1, (1,)))
+    action_space = gymnasium.spaces.Discrete(2, start=1)
+
+
+def test_a_learner_whose_spaces_are_flattened_can_be_pickled():
+    learner = pickle.loads(pickle.dumps(bayespbrl.Learner(Parts(), **QUICK | {"max_steps": 5})))
+    assert learner.environment.observation_space.shape == (8,)
+    assert learner.environment.action_space == gymnasium.spaces.Discrete(2)
+    assert learner.environment.action(np.int64(0)) == 1
+
+
 def test_spaces_in_words_differ_where_their_bounds_do():
     box, other = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Box(np.float32([-1, -2]), np.float32([1, 1]))
     assert in_words(box) == "Box(-1.0, 1.0, (2,))"

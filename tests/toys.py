@@ -50,7 +50,7 @@ class Slope(gymnasium.Env):
         self.life += 1
         fault = self.fault if self.life == self.at else None
         if fault == "raises":
-            raise RuntimeError("the motor is on fire")
+            raise RuntimeError("the motor\nis on fire")
         self.position = self.position + 0.3 * float(action[0]) + self.np_random.normal(0, 0.02, 2)
         seen = np.full(2, np.nan) if fault == "observation" else self.position.copy()
         faulty = {"reward": np.nan, "no reward": None, "rewards": np.ones(1, np.float32)}

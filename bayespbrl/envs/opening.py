@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from copy import deepcopy
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -138,6 +139,18 @@ def given_by_name(environment: object) -> bool:
         for one in (spec, registered)
     ]
     return named[0].keys() == named[1].keys() and all(_same(named[0][name], named[1][name]) for name in named[0])
+
+
+def keywords_of(environment: gymnasium.Env) -> str | None:
+    """The plain arguments that gymnasium made an environment with, in words that differ where these do.
+
+    None for an object that gymnasium did not make.
+    """
+    if environment.spec is None:
+        return None
+    given = sorted((name, value) for name, value in environment.spec.kwargs.items() if name != "render_mode")
+    plain = [(name, value) for name, value in given if isinstance(value, bool | int | float | str)]
+    return ", ".join(f"{name}={value + 0.0 if type(value) is int else value!r}" for name, value in plain) or "none"
 
 
 def _changed(environment: gymnasium.Env) -> bool:
@@ -309,9 +322,9 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
             f"{plain.shape[0]}; wrap it so that it observes less, for example positions in place of a picture"
         )
     if plain is not observations:
-        env = TransformObservation(env, lambda value: to_plain(observations, value, actions), plain)
+        env = TransformObservation(env, partial(to_plain, observations, actions=actions), plain)
     if (plain := bounded(plain_space(actions))) is not actions:
-        env = TransformAction(env, lambda value: from_plain(actions, value), plain)
+        env = TransformAction(env, partial(from_plain, actions), plain)
     if env is not given:
         vars(env)[_GIVEN] = given
     return env

@@ -14,7 +14,7 @@ from gymnasium.wrappers import TimeLimit
 from jaxtyping import Bool, Float, Shaped
 from numpy.typing import ArrayLike
 
-from bayespbrl.checks import shortened, whole
+from bayespbrl.checks import one_line, shortened, whole
 from bayespbrl.envs.functional import FunctionalEnv
 from bayespbrl.envs.opening import (
     AnyEnvironment,
@@ -289,4 +289,4 @@ def _blaming(name: str, where: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise ValueError(f"environment {name} failed at {where}: {type(error).__name__}: {error}") from error
+        raise ValueError(f"environment {name} failed at {where}: {type(error).__name__}: {one_line(error)}") from error

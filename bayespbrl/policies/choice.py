@@ -71,7 +71,7 @@ def expected_policy(given: object) -> str:
     methods = ("sample", "entropy", "kl_divergence", "fit")
     if (lacks := [name for name in methods if not hasattr(given, name)]) and len(lacks) < len(methods):
         return f"a policy (bayespbrl.policies.Policy), got a {type(given).__name__} without {', '.join(lacks)}"
-    return f"a policy (bayespbrl.policies) or a kind by name, got {given!r}"
+    return f"a policy (bayespbrl.policies) or a kind by name, got {checks.shortened(given)}"
 
 
 def fitting(

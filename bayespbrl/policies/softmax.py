@@ -26,6 +26,8 @@ from bayespbrl.policies.sparse_regression import inducing_rows, steady_inverse_f
 
 DECREMENT = 1e-12  # the fit has converged where its quadratic model promises less than half of this, in nats
 NEWTON_STEPS = 50  # at most, O(N A²M²) each; `converged` says whether they sufficed
+CENTRES, LEAST_CENTRES = 50, 10
+MOST_WEIGHTS = 1000  # of the centres, in all actions
 
 
 @jax.tree_util.register_dataclass
@@ -68,7 +70,7 @@ class SoftmaxPolicy:
         action_space: Space[Any],
         *,
         period: ArrayLike | None = None,
-        number_of_centres: int = 50,
+        number_of_centres: int | None = None,
         bandwidth_factor: float = 1.0,
         prior_scale: float = 10.0,
     ) -> Self:
@@ -76,12 +78,14 @@ class SoftmaxPolicy:
 
         Args:
           period: of each observation dimension, infinite where not periodic; None for none.
-          number_of_centres: M.
+          number_of_centres: M; None: 50, and less where with all actions they would be more than `MOST_WEIGHTS`.
           bandwidth_factor: of the median rule; the kernel's length scale.
           prior_scale: prior standard deviation of a logit, in nats.
         """
         states = dimension("observation_space", observation_space)
         actions = number_of_values("action_space", action_space)
+        if number_of_centres is None:
+            number_of_centres = min(CENTRES, max(LEAST_CENTRES, MOST_WEIGHTS // actions))
         number_of_centres = whole("number_of_centres", number_of_centres)
         return cls(
             intercepts=np.zeros(actions),

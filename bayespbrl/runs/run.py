@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import checks, rollouts
-from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, made_again, reopened
+from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, keywords_of, made_again, reopened
 from bayespbrl.envs.spaces import check_of_space, spaces_of
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.features import StateFeatures
@@ -50,9 +50,8 @@ def start(
     learner = Learner(env, **options)
     if learner.own_policy is not None:  # better now than after the first answers
         from_tree(to_tree(learner.own_policy), known=classes_of(learner.own_policy))
-    settings = learner.settings
     place = RunDirectory.create_fresh if directory is None else partial(RunDirectory.create, directory)
-    return learner.logged(place(settings, spaces_of(learner.given)))
+    return learner.logged(place(learner.settings, _environment_of(learner)))
 
 
 def resume(
@@ -122,6 +121,14 @@ def _opened(directory: Path | str, env: AnyEnvironment | None, import_package: b
     return log
 
 
+def _environment_of(learner: Learner) -> dict[str, str]:
+    """What is known of a learner's environment, in words: its spaces, and how an object of the user's was made."""
+    known = spaces_of(learner.given)
+    if learner.settings.environment == "other" and (keywords := keywords_of(learner.given)) is not None:
+        known["keywords"] = keywords
+    return known
+
+
 def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Learner:
     """The learner rebuilt from the log of a run; `own` holds the user's objects, by option name."""
     settings = log.settings
@@ -144,6 +151,9 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
         if env is None:
             env = made_again(settings.env) if settings.environment == "object" else settings.env
         learner = Learner(env, **own, entries=entries, kept=settings)
+        for name, own_now in _environment_of(learner).items():
+            if log.spaces.get(name, own_now) != own_now:
+                raise ValueError(f"env: expected the run's {name}, {log.spaces[name]}, got {own_now}")
         log.check_complete(learner.state, summarised)
         limit = step_limit(learner.environment, settings.rollouts.max_steps)
         for trajectory in learner.trajectories:  # of another environment, where env= is a wrong one
@@ -153,9 +163,6 @@ def _restored(log: RunDirectory, env: AnyEnvironment | None, **own: Any) -> Lear
             check_of_space("actions of the run", trajectory.actions, learner.environment.action_space)
         # of more states or actions than the run's, which those of the trajectories are among
         fitting(learner.last_policy, learner.environment.observation_space, learner.environment.action_space)
-        for name, space in spaces_of(learner.given).items():
-            if log.spaces.get(name, space) != space:
-                raise ValueError(f"env: expected the run's {name}, {log.spaces[name]}, got {space}")
         if own["features"] is not None:
             _check_features(learner)
     except ValueError as error:

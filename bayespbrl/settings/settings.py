@@ -40,7 +40,8 @@ class Features:
     Attributes:
       features: φ(s) as `drawn`: one-hot or radial basis functions at observed states; or `other`, a function of the
         user's.
-      centres: radial basis functions of each kind of feature.
+      centres: radial basis functions of each kind of feature; where actions are discrete Q has as many for each, but at
+        most 2000 in all, or ten for each.
       bandwidth_factor: multiplies the median rule for the features of Q and V.
       utility_bandwidth_factor: multiplies the median rule for the utility's features.
       normalised_utility: whether the utility's radial basis functions are divided by their sum. Decision: they are, so
