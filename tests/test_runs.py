@@ -805,8 +805,19 @@ class Longer(Corridor):
     observation_space = gymnasium.spaces.Discrete(9)
 
 
+def forget_spaces(directory):
+    """Make a run directory as older versions wrote it."""
+    file = directory / "settings.json"
+    file.write_text(
+        json.dumps({name: value for name, value in json.loads(file.read_text()).items() if name != "spaces"})
+    )
+
+
 def test_an_environment_with_more_states_than_the_policy_has_is_refused(tmp_path):
     bayespbrl.start(Corridor(), tmp_path / "run", **IN_THE_CORRIDOR).run(ReturnExpert())
+    with pytest.raises(ValueError, match=r"run: env: expected the run's observation_space, Discrete\(7\), got "):
+        runs.resume(tmp_path / "run", env=Longer())
+    forget_spaces(tmp_path / "run")
     before = contents(tmp_path / "run")
     with pytest.raises(ValueError, match=r"run: policy: expected one from Discrete\(9\) to "):
         runs.resume(tmp_path / "run", env=Longer())
@@ -827,10 +838,7 @@ def test_an_environment_with_other_spaces_is_refused_and_a_run_that_does_not_kno
         with pytest.raises(ValueError, match=message):
             read(tmp_path / "run", env=Counted())
     assert contents(tmp_path / "run") == before
-    file = tmp_path / "run" / "settings.json"
-    file.write_text(
-        json.dumps({name: value for name, value in json.loads(file.read_text()).items() if name != "spaces"})
-    )
+    forget_spaces(tmp_path / "run")
     bayespbrl.load(tmp_path / "run", env=Counted())
 
 
@@ -909,6 +917,9 @@ def test_trajectories_of_different_lengths_and_an_environment_of_the_users_own_c
     assert any(trajectory.terminated for trajectory in learner.trajectories)
     with pytest.raises(ValueError, match="run: expected env= again, which the run was started with, got None"):
         bayespbrl.load(directory)
+    with pytest.raises(ValueError, match=r"run: env: expected the run's observation_space, .*, got Box"):
+        bayespbrl.load(directory, env=Slope())
+    forget_spaces(directory)
     with pytest.raises(ValueError, match=r"run: states of the run: expected entries of Box\(.*, got int64 of"):
         bayespbrl.load(directory, env=Slope())
     run = bayespbrl.load(directory, env=Corridor())
