@@ -15,9 +15,9 @@ variant of its authors, where the pole may fall; in the other tasks an episode t
 reward, until the time limit.
 
 The value is the mean hidden return of 100 episodes without noise, from starts that all methods share. Steps are those
-of the environment that the learner sees; steps and CPU seconds of `posterior-ppo` include the run's. The evaluation is
-left out of both, but bayespbrl's CPU seconds include its own evaluations of each iteration. A run that was interrupted
-counts only the CPU seconds since.
+of the environment that the learner sees, but for the random episodes by which the default chooses options; steps and
+CPU seconds of `posterior-ppo` include the run's. The evaluation is left out of both, but bayespbrl's CPU seconds
+include its own evaluations of each iteration. A run that was interrupted counts only the CPU seconds since.
 
 Each cell is computed in a process of its own, in one of the two virtual environments that `make neighbours` builds:
 imitation needs an older gymnasium and NumPy than bayespbrl. Its row is written as it ends; a second call does only what
