@@ -21,7 +21,13 @@ Rows = Float[Array, "d s"] | Float[np.ndarray, "d s"]
 SMALLEST_SUM = 1e-200  # of a row of products of exponentials: below it they have lost digits
 ROUNDING = 1e-12  # of a dimension of the states, as a share of its largest value
 FAR = 1e6  # bandwidths from the middle, from where on the expansion of the square may lose more than 1e-4
+LEAST_OF_AN_ACTION = 10  # functions of one of many discrete actions
 ROWS_AT_A_TIME = 1024  # keeps a block of a wide kernel matrix in the processor's cache between its three passes
+
+
+def of_each_action(functions: int, actions: int, *, most: int) -> int:
+    """How many functions each discrete action has: `functions`, but at most `most` in all, or ten each."""
+    return min(functions, max(LEAST_OF_AN_ACTION, most // actions))
 
 
 def as_periods(period: ArrayLike | None, dimension: int) -> Float[np.ndarray, "{dimension}"]:

@@ -574,7 +574,7 @@ class Slip(Drifting):
 
 class Broken(Drifting):
     def transition(self, state, action, rng, params=None):
-        raise RuntimeError("the motor is on fire")
+        raise RuntimeError("the motor\nis on fire")
 
 
 @pytest.mark.parametrize(

@@ -854,7 +854,7 @@ def test_an_environment_made_with_other_keywords_is_refused(tmp_path):
             with pytest.raises(ValueError, match=f"run: env: expected the run's keywords, g=3.0, got {got}"):
                 read(tmp_path / "run", env=env)
     assert contents(tmp_path / "run") == before
-    runs.resume(tmp_path / "run", env=made(g=3.0))
+    runs.resume(tmp_path / "run", env=made(g=np.float64(3.0)))
 
 
 class Parts(Corridor):

@@ -17,6 +17,7 @@ from gymnasium.spaces import Box
 from jax import Array
 from jaxtyping import Key, Shaped, UInt8
 
+from bayespbrl.checks import one_line
 from bayespbrl.figures import new_figure, pixels
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def check(dynamics: FuncEnv, name: str) -> None:
             state, first = jax.eval_shape(partial(reset, dynamics), key)
             later = jax.eval_shape(partial(step, dynamics), key, state, zero_action(dynamics))
     except Exception as error:
-        raise ValueError(f"environment {name} failed: {type(error).__name__}: {error}") from error
+        raise ValueError(f"environment {name} failed: {type(error).__name__}: {one_line(error)}") from error
     shape = dynamics.observation_space.shape or ()
     names, shapes = ("observation", "observation", "reward", "terminal"), (shape, shape, (), ())
     for part, got, expected in zip(names, (first, *later[1:]), shapes, strict=True):

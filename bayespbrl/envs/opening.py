@@ -134,8 +134,7 @@ def given_by_name(environment: object) -> bool:
     if spec is None or (registered := gymnasium.registry.get(spec.id)) is None:
         return False
     named = [
-        {name: value for name, value in one.kwargs.items() if name != "render_mode"}
-        | {"max_episode_steps": one.max_episode_steps, "additional_wrappers": one.additional_wrappers}
+        _keywords(one) | {"max_episode_steps": one.max_episode_steps, "additional_wrappers": one.additional_wrappers}
         for one in (spec, registered)
     ]
     return named[0].keys() == named[1].keys() and all(_same(named[0][name], named[1][name]) for name in named[0])
@@ -146,11 +145,23 @@ def keywords_of(environment: gymnasium.Env) -> str | None:
 
     None for an object that gymnasium did not make.
     """
-    if environment.spec is None:
+    spec = environment.spec
+    if spec is None:
         return None
-    given = sorted((name, value) for name, value in environment.spec.kwargs.items() if name != "render_mode")
-    plain = [(name, value) for name, value in given if isinstance(value, bool | int | float | str)]
-    return ", ".join(f"{name}={value + 0.0 if type(value) is int else value!r}" for name, value in plain) or "none"
+    plain = sorted((name, value) for name, value in _keywords(spec).items() if isinstance(value, int | float | str))
+    return ", ".join(f"{name}={_plain_in_words(value)}" for name, value in plain) or "none"
+
+
+def _keywords(spec: EnvSpec) -> dict[str, Any]:
+    """The arguments of a spec that decide what the environment does."""
+    return {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+
+
+def _plain_in_words(value: Any) -> str:
+    """The same for 3, 3.0 and NumPy's 3.0, but for whole numbers that no float is."""
+    if isinstance(value, float) or (type(value) is int and abs(value) <= 2**53):
+        value = float(value)
+    return repr(value)
 
 
 def _changed(environment: gymnasium.Env) -> bool:

@@ -14,11 +14,11 @@ from bayespbrl.checks import indices, matrix
 from bayespbrl.features.discrete import MOST_CONNECTED, OneHot, diffusion_basis, standardised
 from bayespbrl.features.functions import OwnFeatures, StateFeatures
 from bayespbrl.features.radial import JointRadialBasis, RadialBasis, RadialBasisOptions
+from bayespbrl.kernels import of_each_action
 from bayespbrl.trajectories import Trajectory, Transitions
 
 ACTION_BANDWIDTH = 0.5  # of the action kernel, as a fraction of the action's range
-# Functions of Q in all where actions are discrete, and at least for each action: LSTD takes the cube of their number.
-MOST_OF_ACTIONS, LEAST_OF_AN_ACTION = 2000, 10
+MOST_OF_ACTIONS = 2000  # functions of Q in all where actions are discrete: LSTD takes the cube of their number
 EFFORT = 0.1  # prior variance of an observed action's effort in the utility, in that of the functions of a state
 
 
@@ -66,7 +66,7 @@ def draw_state_action_features(
 ) -> JointRadialBasis | StateActionProduct:
     """φ(s, a) for two spaces: joint radial basis functions, or φ(s) ⊗ e_a where actions are `Discrete`.
 
-    Many discrete actions have fewer functions each, so that they are about `MOST_OF_ACTIONS` in all.
+    Many discrete actions have fewer functions each (`of_each_action`).
 
     Args:
       states, actions: observed pairs, shapes (N, S) and (N, A), or (N,) where discrete.
@@ -76,8 +76,7 @@ def draw_state_action_features(
         raise ValueError("normalised: expected False for features of states and actions, got True")
     if isinstance(action_space, Discrete):
         number = int(action_space.n)
-        of_each = max(LEAST_OF_AN_ACTION, MOST_OF_ACTIONS // number)
-        options = replace(options, centres=min(options.centres, of_each))
+        options = replace(options, centres=of_each_action(options.centres, number, most=MOST_OF_ACTIONS))
         return StateActionProduct(draw_state_features(observation_space, states, options, rng=rng), number)
     box = _box("action_space", action_space)
     states = matrix("states", states, columns=_box("observation_space", observation_space).shape[0])

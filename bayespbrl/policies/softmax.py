@@ -26,8 +26,7 @@ from bayespbrl.policies.sparse_regression import inducing_rows, steady_inverse_f
 
 DECREMENT = 1e-12  # the fit has converged where its quadratic model promises less than half of this, in nats
 NEWTON_STEPS = 50  # at most, O(N A²M²) each; `converged` says whether they sufficed
-CENTRES, LEAST_CENTRES = 50, 10
-MOST_WEIGHTS = 1000  # of the centres, in all actions
+CENTRES, MOST_OF_ACTIONS = 50, 1000  # of each action, and of all, unless a number is given
 
 
 @jax.tree_util.register_dataclass
@@ -78,14 +77,14 @@ class SoftmaxPolicy:
 
         Args:
           period: of each observation dimension, infinite where not periodic; None for none.
-          number_of_centres: M; None: 50, and less where with all actions they would be more than `MOST_WEIGHTS`.
+          number_of_centres: M; None: 50, and less with many actions (`kernels.of_each_action`).
           bandwidth_factor: of the median rule; the kernel's length scale.
           prior_scale: prior standard deviation of a logit, in nats.
         """
         states = dimension("observation_space", observation_space)
         actions = number_of_values("action_space", action_space)
         if number_of_centres is None:
-            number_of_centres = min(CENTRES, max(LEAST_CENTRES, MOST_WEIGHTS // actions))
+            number_of_centres = kernels.of_each_action(CENTRES, actions, most=MOST_OF_ACTIONS)
         number_of_centres = whole("number_of_centres", number_of_centres)
         return cls(
             intercepts=np.zeros(actions),

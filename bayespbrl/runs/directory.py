@@ -28,7 +28,7 @@ FORMAT = 3  # format 2 had one setting's posterior beside an average; format 1 n
 HEAVY = ("collected", "improved")  # events with heavy parts, in the file of their iteration
 BASELINE_FILE, FIRST_POLICY_FILE = "baseline.json", "first-policy.json"  # of a study's trials that do not learn so
 Event = dict[str, Any]
-Spaces = Mapping[str, str]  # the environment's, by name, in words
+Spaces = Mapping[str, str]  # the environment's, by name, in words, and the keywords of a user's object
 
 
 class RunDirectory:
