@@ -4,12 +4,14 @@ import itertools
 import json
 
 import gymnasium
+import jax
 import numpy as np
 import pytest
 from test_trials import without_processes
 from toys import Push
 
 import bayespbrl
+from bayespbrl import rollouts
 from bayespbrl.baselines import epmc, every_visit_preferences, pf, programming_by_feedback
 from bayespbrl.diagnostics.report.write import write_report
 from bayespbrl.envs.gridworld import DYNAMICS, REWARDS, START
@@ -175,6 +177,31 @@ def test_epmc_learns_which_action_is_the_best():
     assert np.asarray(last.policy.actions)[:, 0].tolist() == [-1, 0, 1]
     assert table[visited].argmax(axis=1).tolist().count(2) >= 3
     assert next(every_visit_preferences(Push(4), lambda a, b: "tie", answers=1, seed=0, max_steps=4)).pairs == 0
+
+
+def test_what_an_action_was_taken_in_is_the_cell_that_the_policy_acted_by():
+    environment = open_environment("swing-up")  # it starts with speed 0, on the border of two cells
+    policy = epmc.GridPolicy.initial(environment)
+    best = np.random.default_rng(0).integers(3, size=len(policy.table))
+    certain = policy.with_table(np.eye(3)[best])
+    for trajectory in rollouts.rollout(environment, certain, key=jax.random.key(0), episodes=3):
+        cells, numbers = certain.visited(trajectory)
+        assert numbers.tolist() == best[cells].tolist()
+
+
+def test_a_dimension_that_never_varies_has_one_cell():
+    flat = Push(1)
+    flat.observation_space = gymnasium.spaces.Box(np.array([0.0, 1.0]), np.array([1.0, 1.0]), dtype=np.float64)
+    policy = epmc.GridPolicy.initial(flat)
+    assert np.asarray(policy.cells(np.array([[0.5, 1.0], [0.99, 1.0]]))).tolist() == [3, 5]
+
+
+@pytest.mark.parametrize("ask", [every_visit_preferences, programming_by_feedback])
+@pytest.mark.parametrize("wrong", [{"answers": 0}, {"answers": True}, {"answers": 1.5}, {"seed": -1}])
+def test_baselines_refuse_answers_and_seeds_that_are_no_whole_numbers(ask, wrong):
+    (name,) = wrong
+    with pytest.raises(ValueError, match=f"{name}: expected a whole number >= {int(name == 'answers')}, got"):
+        next(ask("swing-up", ReturnExpert(), **{"answers": 1, "seed": 0} | wrong))
 
 
 @pytest.mark.parametrize("ask", [every_visit_preferences, programming_by_feedback])

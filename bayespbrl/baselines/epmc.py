@@ -30,12 +30,13 @@ from gymnasium.spaces import Box
 from jax import Array
 from jaxtyping import Float, Int, Key
 
-from bayespbrl import rollouts
+from bayespbrl import checks, rollouts
 from bayespbrl.baselines.steps import MOST_QUESTIONS, Step
 from bayespbrl.envs.opening import AnyEnvironment, open_environment
 from bayespbrl.experts import Expert
 from bayespbrl.policies.policy import AnyArray
 from bayespbrl.preferences import Answer, parse_answer
+from bayespbrl.trajectories import Trajectory
 
 CELLS = 6  # per dimension of the observation
 MOST_DIMENSIONS = 8  # 1.7 million cells
@@ -51,13 +52,16 @@ def every_visit_preferences(
     Args:
       environment: as of `Learner`; observations in a bounded `Box`, actions in a bounded `Box` of one dimension.
       expert: answers.
-      answers: how many, each on two new trajectories.
+      answers: how many, each on two new trajectories. A question that is skipped has none; at most ten times as many
+        are asked.
       seed: of everything random.
       max_steps: of a trajectory; None: the environment's limit.
 
     Raises:
-      ValueError: other spaces.
+      ValueError: other spaces; no whole number >= 1 as `answers`, or none >= 0 as `seed`.
     """
+    checks.whole("answers", answers)
+    checks.seed(seed)
     environment = open_environment(environment)
     policy = GridPolicy.initial(environment)
     cells, actions = np.asarray(policy.table).shape
@@ -70,7 +74,7 @@ def every_visit_preferences(
         first = rollouts.rollout(
             environment, policy.with_table(exploring), key=keys[0], episodes=1, max_steps=max_steps
         )
-        seen = np.isin(np.arange(cells), policy.cells(first[0].states[:-1]))
+        seen = np.isin(np.arange(cells), policy.visited(first[0])[0])
         mixed = policy.with_table(np.where(seen[:, None], exploring, greedy))
         second = rollouts.rollout(environment, mixed, key=keys[1], episodes=1, max_steps=max_steps)
         shown = [first[0], second[0]]
@@ -78,7 +82,7 @@ def every_visit_preferences(
         if answer is Answer.SKIP:
             continue
         if answer in (Answer.FIRST, Answer.SECOND):
-            visited = [(policy.cells(each.states[:-1]), policy.numbers(each.actions)) for each in shown]
+            visited = [policy.visited(each) for each in shown]
             preferred, other = visited if answer is Answer.FIRST else visited[::-1]
             # Wirth & Fürnkranz (2013): towards the sample, by the learning rate
             better += LEARNING_RATE * (sampled(preferred, other, better) - better)
@@ -90,7 +94,7 @@ def every_visit_preferences(
             return
 
 
-Visits = tuple[Int[AnyArray, " t"], Int[np.ndarray, " t"]]  # cells and numbers of actions
+Visits = tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]  # cells and numbers of actions
 
 
 def sampled(preferred: Visits, other: Visits, before: Float[np.ndarray, "c a a"]) -> Float[np.ndarray, "c a a"]:
@@ -173,13 +177,16 @@ class GridPolicy:
 
     def cells(self, observations: Float[AnyArray, "... s"]) -> Int[Array, "..."]:
         """The number of the cell of each observation."""
-        share = (jnp.asarray(observations) - self.low) / (jnp.asarray(self.high) - self.low)
+        width = jnp.asarray(self.high) - self.low
+        share = (jnp.asarray(observations) - self.low) / jnp.where(width > 0, width, 1)
         places = jnp.clip((share * self.per_dimension).astype(int), 0, self.per_dimension - 1)
         return places @ (self.per_dimension ** jnp.arange(places.shape[-1]))
 
-    def numbers(self, actions: Float[np.ndarray, "t 1"]) -> Int[np.ndarray, " t"]:
-        """The number of each action taken."""
-        return np.argmin(np.abs(actions - np.asarray(self.actions)[:, 0]), axis=1)
+    def visited(self, trajectory: Trajectory) -> Visits:
+        """The cells that a trajectory visited, and the number of the action that it took in each."""
+        with jax.enable_x64(True):  # as rollouts do, or states on a border would be in another cell
+            cells = np.asarray(self.cells(trajectory.states[:-1]))
+        return cells, np.argmin(np.abs(trajectory.actions - np.asarray(self.actions)[:, 0]), axis=1)
 
     def sample(self, key: Key[Array, ""], observation: Float[AnyArray, " s"]) -> Float[Array, "1"]:
         """a ~ π(·|s)."""

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import xlogy
 
-from bayespbrl import rollouts
+from bayespbrl import checks, rollouts
 from bayespbrl.baselines.steps import MOST_QUESTIONS, Step
 from bayespbrl.envs.opening import AnyEnvironment, open_environment
 from bayespbrl.envs.stepping import step_limit
@@ -52,8 +52,11 @@ def programming_by_feedback(
       max_steps: of a trajectory; None: the environment's limit.
 
     Raises:
-      ValueError: an environment whose transition probabilities are not known.
+      ValueError: an environment whose transition probabilities are not known; no whole number >= 1 as `answers`, or
+        none >= 0 as `seed`.
     """
+    checks.whole("answers", answers)
+    checks.seed(seed)
     environment = open_environment(environment)
     table, steps = transition_table(environment), step_limit(environment, max_steps)
     rng = np.random.default_rng([seed, 0])
