@@ -107,6 +107,14 @@ def test_the_paper_preset_is_the_papers_protocol():
     assert (settings.update.updates_per_iteration, settings.update.checked, questions.same_start) == (1, False, False)
 
 
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_of_two_trajectories_there_is_one_question(preset):
+    two = settings_for("SomebodysEnv-v3", task=TASK, preset=preset, trajectories_per_iteration=2)
+    assert two.questions.first_queries == 1
+    with pytest.raises(ValueError, match="first_queries: expected at most 1 with 2 trajectories, got 2"):
+        settings_for("SomebodysEnv-v3", preset=preset, trajectories_per_iteration=2, first_queries=2)
+
+
 def test_an_unknown_option_is_refused_by_name():
     with pytest.raises(ValueError, match=r"settings: expected options among .*steepness.*, got kl_bond"):
         settings_for("gridworld", kl_bond=0.3)
@@ -245,7 +253,7 @@ def test_continuous_actions_have_effort_and_their_policies_are_compared_without_
         {"clip_steps": 20},
         {"utility": "linear-program"},
         {"utility": "known-reward"},
-        {"trajectories_per_iteration": 2, "first_queries": 1},
+        {"trajectories_per_iteration": 2},
     ):
         assert options(**without) == (True, True, False)
     discrete = replace(TASK, action_space=Discrete(2))

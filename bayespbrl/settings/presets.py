@@ -145,11 +145,13 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
       ValueError: an unknown preset.
     """
     name = IDS.get(env, env)
+    few = chosen.get("trajectories_per_iteration") == 2  # one question, and no room for what is kept
+    first = {"first_queries": 1} if few else {}
     if checks.one_of("preset", chosen.get("preset", "default"), NAMES) == "paper":
-        return {"hyperparameters": "given", "trajectory_discount": None} | PAPER.get(name, {})
+        return {"hyperparameters": "given", "trajectory_discount": None} | PAPER.get(name, {}) | first
     expert = chosen.get("expert", "return")
     people = not isinstance(expert, str) or expert not in SIMULATED
-    options = DEFAULT | ({} if task is None else task.derived(people=people)) | TASKS.get(name, {})
+    options = DEFAULT | ({} if task is None else task.derived(people=people)) | TASKS.get(name, {}) | first
     if task is not None:
         for measured in measured_options(env, chosen):
             options |= MEASURED[measured](task)
@@ -160,7 +162,6 @@ def preset_options(env: str, chosen: Mapping[str, Any], task: Task | None = None
     if people:
         options |= PEOPLE
     shown = chosen.get("noise_free", options.get("noise_free"))
-    few = chosen.get("trajectories_per_iteration") == 2  # no room for what is kept
     alone = few or chosen.get("clip_steps") is not None or not chosen.get("checked", True)
     if not shown or alone or chosen.get("utility") in WITHOUT_POSTERIOR:
         options.pop("against_kept", None)
