@@ -64,7 +64,8 @@ def predicted(learner: bayespbrl.Learner) -> pd.DataFrame:
     sums = trajectory_features(learner.trajectories, one_hot, discount=learner.settings.trajectory_discount)
     pairs = learner.preferences.pairs
     rows = []
-    for number in range(learner.iterations[0]["answers"], len(pairs)):
+    gathered = learner.settings.rollouts.trajectories_per_iteration  # in the first iteration
+    for number in range(sum(max(pair) < gathered for pair in pairs), len(pairs)):
         preferred, other = pairs[number]
         row = {}
         for name, (lapse_rate, steepness) in MODELS.items():

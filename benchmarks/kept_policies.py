@@ -90,7 +90,8 @@ def main() -> None:
     if not seeds:
         parser.error(f"{chosen.study}: expected run directories named seed-…, got none")
     one_run = partial(evaluated, chosen.study, chosen.episodes)
-    show(run(seeds, chosen.out, COLUMNS, one_run, jobs=chosen.jobs))
+    about = {"runs": "/".join(chosen.study.resolve().parts[-2:]), "episodes": str(chosen.episodes)}
+    show(run(seeds, chosen.out, COLUMNS, one_run, jobs=chosen.jobs, about=about))
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ def main() -> None:
     chosen = parser.parse_args()
     seeds = range(chosen.seed, chosen.seed + chosen.trials)
     one_run, same = partial(trained, chosen.task, chosen.steps), {"steps": float(chosen.steps)}
-    rows = run(seeds, chosen.out, COLUMNS, one_run, same, jobs=chosen.jobs)
+    rows = run(seeds, chosen.out, COLUMNS, one_run, same, chosen.jobs, about={"task": chosen.task})
     print(f"{chosen.task}, {len(rows)} seeds: median {np.median([row['value'] for row in rows]):.4g}")
 
 

@@ -50,6 +50,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cpu", action="store_true")
     chosen = parser.parse_args()
+    if chosen.answers < 2:
+        parser.error(f"--answers: expected at least 2, as no question follows the last, got {chosen.answers}")
     learner = bayespbrl.Learner(chosen.env, answers=chosen.answers, seed=chosen.seed, expert="other")
     session = Session(learner).open()
     try:

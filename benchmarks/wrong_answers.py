@@ -73,5 +73,7 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=4400)
     parser.add_argument("--out", type=Path, default=RESULTS)
     chosen = parser.parse_args()
+    if not 0 <= chosen.wrong <= 0.5:  # the lapse rate is twice that
+        parser.error(f"--wrong: expected a number from 0 to 0.5, got {chosen.wrong}")
     seeds = range(chosen.seed, chosen.seed + chosen.runs)
     show(run(seeds, chosen.out, COLUMNS, partial(one_run, wrong=chosen.wrong), {"wrong": chosen.wrong}))

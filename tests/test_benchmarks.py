@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -260,6 +261,35 @@ def test_rows_by_seed_go_on_where_they_were_cut(tmp_path):
         rows_by_seed.run([6], file, columns, square, {"square": 36})
     with pytest.raises(SystemExit, match="expected a column cube, got none; choose another --out"):
         rows_by_seed.run([6], file, [*columns, "cube"], square)
+
+
+def test_a_figure_that_is_none_is_kept_and_rows_of_another_task_are_refused(tmp_path):
+    rows_by_seed, file, columns = benchmark("rows_by_seed"), tmp_path / "rows.csv", ["seed", "value"]
+    computed = []
+
+    def nothing(seed):
+        computed.append(seed)
+        return {"seed": seed, "value": float("nan")}
+
+    for _ in range(3):
+        (row,) = rows_by_seed.run([5], file, columns, nothing, about={"task": "CartPole-v1"})
+        assert row["seed"] == 5
+        assert np.isnan(row["value"])
+    assert computed == [5]
+    assert file.read_text().splitlines()[0] == "task,seed,value"
+    with pytest.raises(SystemExit, match="expected rows with task Acrobot-v1, got CartPole-v1; choose another --out"):
+        rows_by_seed.run([5], file, columns, nothing, about={"task": "Acrobot-v1"})
+
+
+def waited(seed):
+    time.sleep(1.0 if seed == 1 else 0.0)
+    return {"seed": seed}
+
+
+@pytest.mark.slow
+def test_rows_of_several_processes_are_written_as_they_end(tmp_path):
+    rows = benchmark("rows_by_seed").run([1, 2, 3], tmp_path / "rows.csv", ["seed"], waited, jobs=2)
+    assert [row["seed"] for row in rows] == [2, 3, 1]
 
 
 def test_ranks_of_another_model_are_not_taken_for_those_of_this_one(tmp_path):
