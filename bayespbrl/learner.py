@@ -37,7 +37,8 @@ class Learner:
     two. Every event is appended to a log first, and the state is a fold over that log.
 
     Args:
-      env: a short name (`gridworld`, …), a gymnasium id, or an environment.
+      env: a short name (`gridworld`, …) or a gymnasium id, with arguments (`FrozenLake-v1,is_slippery=False`) or
+        without, or an environment.
       features: φ of your own, from observations (N, S) to (N, D), in any units; None: drawn as the settings say.
       policy: a kind of policy by name, or a first policy of your own, where the updates start; it is not kept itself.
       schedule: of the KL bound by name, or one of your own (`bayespbrl.improvement.schedules`).

@@ -70,7 +70,9 @@ ImportPackage = Annotated[
     bool,
     typer.Option("--import-package", help="Import the package that the run's environment names; this runs its code."),
 ]
-Env = Annotated[str, typer.Argument(help=f"{', '.join(SHORT_NAMES)}, or any gymnasium id.")]
+Env = Annotated[
+    str, typer.Argument(help=f"{', '.join(SHORT_NAMES)}, or any gymnasium id, as Pendulum-v1, or Pendulum-v1,g=9.81.")
+]
 
 
 # The options of a run and of each trial, with their help. One left out has the value of the environment's preset.

@@ -2,6 +2,7 @@
 
 gridworld, bicycle, swing_up, acrobot  the four domains: their dynamics as pure functions; angles helps them
 functional                             pure functions as a gymnasium environment
+names                                  what a name says: short names, ids, packages, arguments
 opening                                any environment, made ready for the learner; spaces: rows of numbers
 stepping                               episodes of environments without pure functions
 pictures, film_strip                   a trajectory as a picture

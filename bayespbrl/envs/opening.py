@@ -1,11 +1,8 @@
 """Any gymnasium environment, made ready for the learner: opened by name, its spaces checked and flattened."""
 
-import sys
 from collections.abc import Iterator
 from copy import deepcopy
 from functools import partial
-from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -28,6 +25,7 @@ from gymnasium.wrappers import (
 from bayespbrl import checks
 from bayespbrl.envs import SHORT_NAMES
 from bayespbrl.envs.functional import FunctionalEnv
+from bayespbrl.envs.names import parsed, spec_named
 from bayespbrl.envs.spaces import bounded, from_plain, plain_space, to_plain
 
 # Attributes of dynamics that are about their own observations.
@@ -41,24 +39,6 @@ AnyEnvironment = str | EnvSpec | gymnasium.Env | FuncEnv
 # Attributes of an environment object, which its copies have too: the spec from which we made it, so that it can be made
 # again, N at a time, and what `flattened` wrapped.
 _MADE_FROM, _GIVEN = "_bayespbrl_made_from", "_bayespbrl_given"
-
-
-def imported_by_name(environment: object) -> str:
-    """The module that opening `environment` would import, as gymnasium's "module:Env-v0"; empty for none.
-
-    One that is imported already is none.
-    """
-    module = environment.rpartition(":")[0] if isinstance(environment, str) else ""
-    return "" if module in sys.modules else module
-
-
-def check_permission(name: str, directory: Path) -> None:
-    """`ValueError` where opening a directory's environment by name would import a package, which runs its code."""
-    if package := imported_by_name(name):
-        raise ValueError(
-            f"{directory}: expected permission to import {package!r}, which {name} needs, got none: "
-            "import_package=True, or --import-package on the command line"
-        )
 
 
 def open_environment(environment: AnyEnvironment) -> gymnasium.Env:
@@ -214,9 +194,13 @@ def _alike(mine: Any, made: Any, depth: int = 5) -> bool:
 
 
 def identity(environment: object) -> str | None:
-    """gymnasium's id of an environment or of its name; None where the name alone does not open the same one again."""
+    """gymnasium's id of an environment or of its name, with the arguments that the name has.
+
+    None where the name alone does not open the same one again.
+    """
     if isinstance(environment, str):
-        return SHORT_NAMES.get(environment, environment).rpartition(":")[2]
+        name = parsed(environment)
+        return ",".join([name.id, *(f"{argument}={value!r}" for argument, value in sorted(name.arguments.items()))])
     given = as_given(environment) if isinstance(environment, gymnasium.Env) else environment
     spec = _spec_of(given)
     return spec.id if spec is not None and given_by_name(given) else None
@@ -285,22 +269,7 @@ def layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
 
 
 def _spec(environment: str | EnvSpec) -> EnvSpec:
-    if isinstance(environment, EnvSpec):
-        return environment
-    name = SHORT_NAMES.get(environment, environment)
-    try:
-        module, _, name = name.rpartition(":")  # "package:Env-v0", as gymnasium has it, imports the package first
-        if module:
-            import_module(module)
-        return gymnasium.spec(name)
-    except Exception as error:  # a module of the user's may raise anything
-        missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        here = missing == module and module in {path.stem for path in Path().glob("*.py")}
-        hint = "; PYTHONPATH=. lets it be found" if here else ""
-        raise ValueError(
-            f"environment: expected {', '.join(SHORT_NAMES)} or a registered gymnasium id, got {environment!r} "
-            f"({checks.one_line(error)}{hint})"
-        ) from error
+    return environment if isinstance(environment, EnvSpec) else spec_named(environment)
 
 
 def _make(spec: EnvSpec) -> gymnasium.Env:

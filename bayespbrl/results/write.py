@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 import pandas as pd
 
-from bayespbrl.envs.opening import check_permission
+from bayespbrl.envs.names import check_permission
 from bayespbrl.figures import png
 from bayespbrl.results.figures import curves_figure, profiles_figure
 from bayespbrl.results.predictions import write_predictions

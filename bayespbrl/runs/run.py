@@ -10,7 +10,8 @@ import numpy as np
 import xarray as xr
 
 from bayespbrl import checks, rollouts
-from bayespbrl.envs.opening import AnyEnvironment, check_permission, identity, keywords_of, made_again, reopened
+from bayespbrl.envs.names import check_permission
+from bayespbrl.envs.opening import AnyEnvironment, identity, keywords_of, made_again, reopened
 from bayespbrl.envs.spaces import check_of_space, spaces_of
 from bayespbrl.envs.stepping import step_limit
 from bayespbrl.features import StateFeatures

@@ -20,7 +20,8 @@ from bayespbrl.diagnostics.estimates import predicted_answer
 from bayespbrl.diagnostics.predictions import fitted_model
 from bayespbrl.diagnostics.report.document import ReportWarning
 from bayespbrl.diagnostics.report.log import AnsweredQuestion, Summary, read_log
-from bayespbrl.envs.opening import environment_attribute, imported_by_name, open_environment
+from bayespbrl.envs.names import imported_by_name
+from bayespbrl.envs.opening import environment_attribute, open_environment
 from bayespbrl.envs.spaces import check_of_space
 from bayespbrl.envs.stepping import of_whole_episodes
 from bayespbrl.features import StateFeatures, checked_features
