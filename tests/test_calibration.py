@@ -261,3 +261,10 @@ def test_invalid_predictions_are_refused(arguments, message):
 def test_arguments_that_do_not_fit_the_posterior_are_refused(tree, arguments, message):
     with pytest.raises(ValueError, match=message):
         calibration(tree, **arguments)
+
+
+def test_the_error_that_calibrated_predictions_are_expected_to_have_is_of_simulated_answers_alone():
+    predicted = np.full(4, 0.9)
+    scores = score_predictions(predicted, np.zeros(4, bool), simulations=1, seed=0)
+    drawn = np.random.default_rng(0).random((1, 4)) < predicted
+    assert scores["expected_calibration_error_expected"] == pytest.approx(abs(drawn.mean() - 0.9))

@@ -1,8 +1,12 @@
 """The check of an update: the newest policy beside the best by the utility of their trajectories."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from bayespbrl.cycle import Cycle
+from bayespbrl.events.state import NumberedPolicy, Restart
 from bayespbrl.improvement.check import (
     CLEARLY,
     LEAST_TRUST,
@@ -13,6 +17,7 @@ from bayespbrl.improvement.check import (
     median_differences,
     share_better,
 )
+from bayespbrl.preferences import Answer
 
 NOISE = np.array([-1.0, 1.0, -0.5, 0.5])
 
@@ -85,3 +90,49 @@ def test_without_a_posterior_the_estimate_decides():
     assert share_better(equal, equal) < POSSIBLY
     posterior = judged(Posterior(), [np.r_[-1.0, -1.0, 3.0]], by_draws=False)
     np.testing.assert_array_equal(posterior, [[1 / 3]])
+
+
+def test_the_median_over_the_draws_is_that_of_the_differences():
+    newest, best = np.array([[1.0], [2.0], [9.0]]), np.array([[0.0], [5.0], [7.0]])  # 1, -3, 2; of each alone 2 and 5
+    np.testing.assert_array_equal(median_differences(newest, best), [1])
+
+
+@pytest.mark.parametrize(("newest", "best", "better"), [(5.0, 1.0, 7), (1.0, 5.0, 3)])
+def test_the_utilities_that_come_with_a_check_are_of_the_better_policy(newest, best, better):
+    state = SimpleNamespace(
+        iteration=7,
+        started=0,
+        trust=1.0,
+        newest=NumberedPolicy(7, None, (newest, newest + 1)),
+        best=NumberedPolicy(3, None, (best, best + 1)),
+    )
+    cycle = SimpleNamespace(_judged=lambda utility, tried: np.array([tried]))
+    check, of_best = Cycle._check(cycle, state, None)
+    assert check.best == better
+    np.testing.assert_array_equal(of_best, [[5, 6]])
+
+
+@pytest.mark.parametrize(
+    ("answer", "newest", "kept", "marks"),
+    [
+        (Answer.FIRST, 3.0, 9, {"confirmed": True, "nominated": True}),
+        (Answer.FIRST, 1.0, 9, {"confirmed": True}),  # better than what was kept, but not than what is now
+        (Answer.SKIP, 1.0, 5, {"nominated": True}),
+    ],
+)
+def test_a_restarted_policy_is_kept_once_asked_about_and_the_next_one_has_to_be_better_than_it(
+    answer, newest, kept, marks
+):
+    def tried(utility):
+        return np.full(4, utility), np.full(4, utility)
+
+    utility = SimpleNamespace(posterior="drawn", trajectory_draws=lambda tried: np.array(tried).T)
+    restart = Restart(5, NumberedPolicy(5, None, tried(0.0)))
+    state = SimpleNamespace(
+        past=(SimpleNamespace(newcomer=19, answer=answer),),
+        iteration=9,
+        started=5,
+        trajectories=range(20),
+        newest=NumberedPolicy(9, None, tried(2.0)),
+    )
+    assert Cycle._confirmed(None, state, restart, utility, tried(newest)) == (kept, marks)

@@ -508,3 +508,18 @@ def test_the_critic_takes_the_last_iterations_but_neither_too_few_nor_too_many_t
     assert taken([900] * 200, 100) == 11  # 10 000 at most
     assert taken([3000] * 20, 4) == 6  # but six trajectories, the last of which may be without noise
     assert taken([20_000] * 20, 2) == 4
+
+
+def test_q_is_that_of_actions_kept_within_the_bounds_and_the_policy_is_fitted_to_the_actions_as_drawn():
+    rng = np.random.default_rng(2)
+    policy = LinearGaussianPolicy.initial(OBSERVATIONS, FORCES, initial_scale=0.5)
+    states = rng.uniform(-1, 1, size=(200, 2))
+    actions = clipped(sample_actions(policy, jax.random.key(0), states), FORCES)
+    steps = Transitions(states, actions, states, np.zeros(200), np.ones(200, bool))
+    features = {"state_features": lambda s: s, "state_action_features": quadratic}
+    given = problem(steps, -(actions[:, 0] ** 2), action_space=FORCES, critic=Critic(0.0), **features)
+    proposed = update.propose(policy, given, key=jax.random.key(1))
+    seen, drawn = proposed.samples
+    assert np.any(drawn > FORCES.high)
+    assert np.any(drawn < FORCES.low)
+    np.testing.assert_allclose(proposed.q_values, proposed.q_functions(seen, clipped(drawn, FORCES)))

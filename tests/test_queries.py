@@ -447,3 +447,26 @@ def test_a_rule_that_names_undominated_trajectories_only_is_refused(order_given)
     message = r"query rule fond: expected a trajectory other than the undominated \[1, 3\], got \["
     with pytest.raises(ValueError, match=message):
         candidates(fond, given)
+
+
+def test_eubo_asks_about_the_best_of_both_where_each_has_an_opponent_of_its_own():
+    # the second is better than its opponent by more, the first has the better best: E max 5 and 4
+    table = np.array([[5.0, 4.0, 5.0, 1.0]])
+    given = replace(situation(table[:, :3], table[:, 3]), new=[0, 1], opponents={0: 2, 1: 3})
+    assert QUERY_RULES["eubo"](given) == [0, 1]
+
+
+def test_where_worth_counts_a_question_that_tells_little_is_asked_after_one_that_tells_much():
+    """The third is without noise: once in a hundred its opponent is far better, worth an answer that tells little."""
+    chance = np.where(np.arange(1000) < 10, 500.0, 10.0)
+    draws = np.column_stack([np.where(np.arange(1000) % 2, 9.0, -9.0), chance, np.full(1000, 20.0)])
+    given = replace(situation(draws, np.zeros(1000)), noise_free=2, opponents={2: 1}, shown=frozenset({0, 3}))
+    given.estimate.answers = WithLapses(Logistic(1.0), 0.6)
+    given.estimate.posterior, given.estimate.quality = "drawn", SimpleNamespace(converged=True)
+    assert given.at_stake() == (2,)
+    assert given.told_by(2) < LEAST_INFORMATION < given.told_by(0)
+    for worthwhile, first in ((False, 2), (True, 0)):
+        options = Questions(answers=20, against_kept=True, worthwhile=worthwhile)
+        after = Preferences(((0, 3),), (3,), 8)
+        chosen = later_questions(QUERY_RULES["information"], given, options, after, unasked=0)
+        assert (chosen.wanted, chosen.candidates[0]) == (1, first)

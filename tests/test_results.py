@@ -37,6 +37,7 @@ from bayespbrl.results.intervals import (
 from bayespbrl.results.study_data import StudyData
 from bayespbrl.studies import Study
 from bayespbrl.studies.declaration import parsed
+from bayespbrl.studies.tables import by_answers
 
 STUDIES = Path(__file__).parents[1] / "benchmarks" / "studies"
 DECLARATION = """
@@ -582,3 +583,18 @@ def test_studies_whose_results_would_overwrite_each_other_are_refused(made, tmp_
     line = refused(monkeypatch, capsys, "results", made, other, "--out", tmp_path / "out")
     assert "out: expected studies in directories of different names, got made more than once" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_the_ceiling_of_a_task_is_the_better_of_two_runs_on_the_hidden_reward(made):
+    (made / "study.toml").write_text(DECLARATION + '[methods.worse]\nutility = "known-reward"\n')
+    table = pd.read_csv(made / "iterations.csv")
+    more = table[table["methods"] == "known"].assign(methods="worse", value=40, value_newest=40)
+    pd.concat([table, more]).to_csv(made / "iterations.csv", index=False)
+    assert read_study(made).floor_and_ceiling("gridworld") == (0, 100)
+
+
+def test_values_by_answers_begin_where_every_trial_has_a_policy():
+    answers, values = np.array([[1, 2, 4], [2, 3, 4]]), np.array([[10.0, 20, 40], [21, 31, 41]])
+    numbers, each = by_answers(answers, values)
+    np.testing.assert_array_equal(numbers, [2, 3, 4])
+    np.testing.assert_array_equal(each, [[20, 20, 40], [21, 31, 41]])
