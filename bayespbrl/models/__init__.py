@@ -11,7 +11,8 @@ preference_problem       the model in low rank given all else, and the ellipses 
 gibbs                    moves over all else: length scales, steepness, lapse rates, tie threshold; chains runs both
 surrogate_moves          between length scales, keeping the margins: for chains that take long to converge
 step_moves               for many answers under eq. 8: flights (refraction), lapse rates with weights (lapse_transport),
-                         single weights where few answers touch each (coordinate_sweep)
+                         single weights where few answers touch each (coordinate_sweep), and from mode to mode, where
+                         chains take long (tempering)
 split_dynamics           for many answers without steps: dynamics round the reference
 evidence                 the marginal likelihood, by bridge sampling
 plain_chain              the paper's sampler: a chain of fixed length

@@ -11,7 +11,7 @@ from jax import Array, lax, random
 from jaxtyping import Bool, Float, Shaped
 from scipy.special import softmax
 
-from bayespbrl.models.elliptical_slice import Ellipse, independent_move
+from bayespbrl.models.elliptical_slice import Ellipse
 from bayespbrl.models.elliptical_slice_kernel import Args, EllipticalSlice, EllipticalSliceState, Keywords, SiteValues
 from bayespbrl.models.gaussian_fit import GaussianFit
 from bayespbrl.models.gibbs import (
@@ -29,7 +29,6 @@ from bayespbrl.models.likelihoods import has_steps, log_prob, ties_of, total_log
 from bayespbrl.models.low_rank import used_rows
 from bayespbrl.models.preference_problem import (
     PreferenceProblem,
-    axis_ellipse,
     low_rank_model,
     padded_problem,
     prior_ellipse,
@@ -38,7 +37,7 @@ from bayespbrl.models.preference_problem import (
 from bayespbrl.models.priors import Grid, given
 from bayespbrl.models.split_dynamics import split_move
 from bayespbrl.models.step_moves import Steps, step_moves, steps_of
-from bayespbrl.models.surrogate_moves import surrogate_moves
+from bayespbrl.models.surrogate_moves import surrogate_moves, with_surrogates
 from bayespbrl.models.threads import in_threads
 
 # Share of each answer's Gaussian factor that enters the reference: with all of it the reference is as narrow as the
@@ -48,11 +47,8 @@ REFERENCE_POWER = 0.5
 # Moves around the reference's and the prior's ellipses per recorded draw; those around the prior's help in the tails.
 # They are split into SWEEPS sweeps where more than the weights is unknown: lapse rate and weights move in turn.
 REFERENCE_MOVES, PRIOR_MOVES, SWEEPS = 26, 6, 6
-# Above `FEW` answers other moves are made, and the references are fitted again after the burn-in. With steps and ties:
-# STEP_MOVES round the reference per sweep, and INDEPENDENT draws tried in at most LOW_DIMENSION dimensions; in more,
-# every coordinate of the reference has a move of its own. With steps alone the weights move by flights.
-LOW_DIMENSION, STEP_MOVES, INDEPENDENT = 32, 24, 256
-# Without steps the reference is nearly the posterior, and most is done by its dynamics.
+# Above `FEW` answers other moves are made, and the references are fitted again after the burn-in. Among steps the
+# weights move by flights; without steps the reference is nearly the posterior, and most is done by its dynamics.
 SMOOTH_MOVES = 1
 # Of the reference that is fitted again: among contradicting answers the posterior is wider than any one Gaussian fit.
 LEAST_POWER = 0.2
@@ -157,6 +153,13 @@ class Chains:
         draws = {name: self.values(name, self.length) for name in ("steepness", "lapse_rate", "tie_threshold")}
         return {name: float((np.median if name == "tie_threshold" else np.mean)(them)) for name, them in draws.items()}
 
+    def with_further_moves(self) -> "Chains":
+        """The same chains with the moves for slow ones; as they are, where they have them or there are none."""
+        if self.steps is not None and self.steps.tempered is None:
+            return replace(self, steps=self.steps._replace(tempered=()))
+        problem = with_surrogates(self.problem)
+        return self if problem is self.problem else replace(self, problem=problem)
+
     @property
     def length(self) -> int:
         """Number of draws in each chain so far."""
@@ -230,21 +233,16 @@ def _with_reference(fit: GaussianFit, rank: int, power: float = REFERENCE_POWER)
 
 
 def _flies(problem: PreferenceProblem) -> bool:
-    """Whether the weights move by flights too: many answers, and one step each."""
-    steps = has_steps(problem.likelihood) and ties_of(problem.likelihood) is None
-    return problem.loadings.shape[-2] > FEW and steps
+    """Whether the weights move by flights: many answers, and steps."""
+    return problem.loadings.shape[-2] > FEW and has_steps(problem.likelihood)
 
 
 def _ellipses(model_args: Args, model_kwargs: Keywords, *, sweeps: int = 1) -> list[tuple[Ellipse, int]]:
     (problem,) = model_args
-    capacity, rank = problem.loadings.shape
-    if capacity > FEW:
+    if problem.loadings.shape[0] > FEW:
         if not has_steps(problem.likelihood):
             return [(reference_ellipse(problem), SMOOTH_MOVES), (prior_ellipse(problem), 1)]
-        if _flies(problem):
-            return [(prior_ellipse(problem), 1)]
-        axes = [(axis_ellipse(problem), rank)] if rank > LOW_DIMENSION else []
-        return [*axes, (reference_ellipse(problem), STEP_MOVES), (prior_ellipse(problem), 1)]
+        return [(prior_ellipse(problem), 1)]
     return [
         (reference_ellipse(problem), -(-REFERENCE_MOVES // sweeps)),
         (prior_ellipse(problem), -(-PRIOR_MOVES // sweeps)),
@@ -264,12 +262,11 @@ KERNEL, KERNEL_OF_SWEEP = (
 
 
 def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem) -> Recorded:
-    """One draw of one chain, and log p of each answer there."""
+    """One draw of one chain of few answers, or without steps, and log p of each answer there."""
     grids = problem.steepness.values, problem.lapse_rate.values, problem.tie_threshold.values
     unknown = any(len(prior) > 1 for prior in (problem.log_probabilities, *grids))
-    capacity, rank = problem.settings.loadings.shape[1:]
+    capacity = problem.settings.loadings.shape[1]
     kernel, sweeps = (KERNEL_OF_SWEEP, SWEEPS) if unknown and capacity <= FEW else (KERNEL, 1)
-    independent = capacity > FEW and rank <= LOW_DIMENSION and has_steps(problem.settings.likelihood)
 
     def sweep(
         last: tuple[EllipticalSliceState, Unknowns], _: None
@@ -280,10 +277,7 @@ def draw(state: EllipticalSliceState, unknowns: Unknowns, problem: JointProblem)
         if problem.surrogates:
             key, key_surrogates = random.split(key)
             z, unknowns = surrogate_moves(key_surrogates, z, unknowns, problem)
-        if independent:
-            ellipse = reference_ellipse(conditional(problem, unknowns))
-            z = independent_move(key_weights, z, ellipse, candidates=INDEPENDENT)
-        if capacity > FEW and not has_steps(problem.settings.likelihood):
+        if capacity > FEW:
             z = split_move(key_weights, z, conditional(problem, unknowns))
         state = state._replace(z={"utility_weights": z}, rng_key=key)
         state = kernel.sample(state, (conditional(problem, unknowns),), {})

@@ -2,8 +2,7 @@
 
 A move is x ← c + (x − c) cos α + (ν − c) sin α with a fresh ν ~ N(c, Σ). With the prior as that Gaussian the slice is
 one of the likelihood. With any other Gaussian, the reference, it is one of prior × likelihood / reference, and the move
-leaves the posterior invariant all the same (Nishihara, Murray & Adams 2014). Two relatives of the move share its slice:
-an ellipse in one whitened coordinate alone, and independent draws of the Gaussian.
+leaves the posterior invariant all the same (Nishihara, Murray & Adams 2014).
 """
 
 from collections.abc import Callable
@@ -34,16 +33,12 @@ class Ellipse(NamedTuple):
       noise: (key, moves) ↦ v′ of fresh draws of the Gaussian.
       residual: J points v ↦ log(target / Gaussian) at each.
       lower: v ↦ x.
-      turn: (v, fresh draw, angles) ↦ points of the ellipse.
-      batch: candidates evaluated at once; None: as many as the kernel says.
     """
 
     lift: Callable[[Float[Array, " n"]], Float[Array, "*v"]]
     noise: Callable[[PRNGKeyArray, int], Float[Array, " moves *v"]]
     residual: Callable[[Float[Array, " j *v"]], Float[Array, " j"]]
     lower: Callable[[Float[Array, "*v"]], Float[Array, " n"]]
-    turn: Callable[[Float[Array, "*v"], Float[Array, "*v"], Float[Array, " j"]], Float[Array, " j *v"]] = turned
-    batch: int | None = None
 
 
 _Bracket = tuple[Float[Array, "*m"], Float[Array, "*m"], Float[Array, "*m"]]  # the angle, and its ends
@@ -87,7 +82,7 @@ def elliptical_moves(
 
     Source: Murray, Adams & MacKay (2010), figure 2.
     """
-    v, batch = ellipse.lift(x), ellipse.batch or batch
+    v = ellipse.lift(x)
     ahead = min(BATCHES_AHEAD, -(-max_candidates // batch))
     drawn = _drawn(key, ellipse, x.dtype, moves=moves, batches=ahead, batch=batch)
 
@@ -96,14 +91,14 @@ def elliptical_moves(
     def evaluate(walk: _Walk) -> _Walk:
         candidates, bracket = _next_candidates(walk, drawn)
         fresh = drawn.noise[walk.move]
-        values = ellipse.residual(ellipse.turn(walk.v, fresh, candidates))  # figure 2, step 4
+        values = ellipse.residual(turned(walk.v, fresh, candidates))  # figure 2, step 4
         # figure 2, step 5; NaN compares as false, so that a NaN candidate is rejected
         accepted = values > walk.value + drawn.heights[walk.move]
         first_accepted, found = jnp.argmax(accepted), jnp.any(accepted)
         failed = ~found & ((walk.batches + 1) * batch >= max_candidates)
         angle = jnp.where(found, candidates[first_accepted], 0.0)
         return _Walk(
-            v=ellipse.turn(walk.v, fresh, angle[None])[0],
+            v=turned(walk.v, fresh, angle[None])[0],
             value=jnp.where(found, values[first_accepted], walk.value),
             move=walk.move + (found | failed),
             batches=jnp.where(found | failed, 0, walk.batches + 1),
@@ -119,25 +114,6 @@ def elliptical_moves(
     start = _Walk(v, value, zero, zero, drawn.brackets[0], zero, jnp.zeros((), bool))
     end = lax.while_loop(lambda walk: walk.move < moves, evaluate, start)
     return ellipse.lower(end.v), end.tried, end.stuck
-
-
-def independent_move(
-    key: PRNGKeyArray, x: Float[Array, " n"], ellipse: Ellipse, *, candidates: int
-) -> Float[Array, " n"]:
-    """The first of `candidates` independent draws of the ellipse's Gaussian on the slice; `x` where none is.
-
-    Given the slice's height, the target's conditional distribution is that Gaussian restricted to the slice, and
-    whether a draw falls into it does not depend on `x`: the move is exact. It goes anywhere at once, in few dimensions.
-
-    Source: slice sampling, Neal (2003).
-    """
-    key_height, key_noise = random.split(key)
-    v = ellipse.lift(x)
-    value = ellipse.residual(v[None])[0]
-    height = jnp.where(value > -jnp.inf, value, -jnp.inf) + jnp.log(random.uniform(key_height, dtype=x.dtype))
-    fresh = ellipse.noise(key_noise, candidates)
-    accepted = ellipse.residual(fresh) > height
-    return jnp.where(jnp.any(accepted), ellipse.lower(fresh[jnp.argmax(accepted)]), x)
 
 
 class _Walk(NamedTuple):

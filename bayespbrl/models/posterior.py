@@ -17,7 +17,6 @@ from bayespbrl.models.gaussian_fit import GaussianFit, fit_gaussian, refitted
 from bayespbrl.models.likelihoods import has_steps, ties_of
 from bayespbrl.models.posterior_tree import fit_attributes, margins_of, posterior_tree, settings_of
 from bayespbrl.models.preference_model import NOTHING_ELSE, Answers, PreferenceModel
-from bayespbrl.models.surrogate_moves import with_surrogates
 from bayespbrl.models.threads import one_blas_thread
 
 # A setting that fewer draws have is not diagnosed: how many do is known too badly, and matters little.
@@ -180,12 +179,11 @@ def _until_converged(
         if report.converged() or 2 * wanted > sampler.max_samples:
             return chains, wanted, report
         slow = wanted >= LONG * sampler.num_samples
-        further = with_surrogates(chains.problem) if slow else chains.problem
-        if further is chains.problem:
+        further = chains.with_further_moves() if slow else chains
+        if further is chains:
             wanted *= 2
         else:
-            chains = replace(replace(chains, problem=further).extended(sampler.num_warmup), draws=())
-            wanted = sampler.num_samples
+            chains, wanted = replace(further.extended(sampler.num_warmup), draws=()), sampler.num_samples
 
 
 def _needs_better_references(chains: Chains, fit: GaussianFit, model: PreferenceModel) -> bool:

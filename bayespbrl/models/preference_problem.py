@@ -19,9 +19,6 @@ from bayespbrl.models.likelihoods import Likelihood, Scalar, WithLapses, WithTie
 from bayespbrl.models.low_rank import used_rows
 from bayespbrl.models.preference_model import preference_model
 
-# Candidates evaluated at once along one coordinate, where fewer than two are rejected in the mean.
-AXIS_BATCH = 3
-
 
 class PreferenceProblem(NamedTuple):
     """t = L z, z ~ N(0, σ²I): what the compiled sampler takes, padded to capacities c ≥ K and q ≥ r.
@@ -110,29 +107,6 @@ def _scaled_ellipse(problem: PreferenceProblem, excess: Scalar) -> Ellipse:
         return lifted(jnp.asarray(width * (whitened @ problem.root.T)))
 
     return Ellipse(lambda z: lifted(z - centre), noise, residual, lambda v: centre + v[number + 1 :])
-
-
-def axis_ellipse(problem: PreferenceProblem) -> Ellipse:
-    """Ellipses in one whitened coordinate of the reference at a time, in their order; the others stay.
-
-    With hundreds of steps an ellipse in all dimensions ends at the nearest; along one axis few are near.
-    """
-    reference = reference_ellipse(problem)
-    number, rank = problem.loadings.shape
-    map_displacement = jnp.concatenate([problem.loadings, problem.centre[None] / problem.prior_scale**2])
-    columns = jnp.concatenate([map_displacement @ problem.root, jnp.eye(rank)]).T
-
-    def noise(key: PRNGKeyArray, moves: int) -> Float[Array, "{moves} 2"]:
-        axes = jnp.arange(moves, dtype=columns.dtype) % rank
-        return jnp.stack([axes, random.normal(key, (moves,), dtype=columns.dtype)], axis=1)
-
-    def turn(v: Float[Array, " v"], fresh: Float[Array, "2"], angles: Float[Array, " j"]) -> Float[Array, "j v"]:
-        axis = fresh[0].astype(int)
-        # Murray, Adams & MacKay (2010), figure 2, step 4, in one coordinate
-        step = v[number + 1 + axis] * (jnp.cos(angles) - 1) + fresh[1] * jnp.sin(angles)
-        return v + step[:, None] * columns[axis]
-
-    return reference._replace(noise=noise, turn=turn, batch=AXIS_BATCH)
 
 
 def prior_ellipse(problem: PreferenceProblem) -> Ellipse:

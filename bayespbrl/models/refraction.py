@@ -25,18 +25,25 @@ MOST_EVENTS = 20
 
 
 class Walls(NamedTuple):
-    """Where the likelihood of z = σ y jumps: at normals · y = 0.
+    """Where the likelihood of z = σ y jumps: where a margin, a row of normals · y, is at a wall's place.
 
     Attributes:
       normals: σ L.
       products: of the normals with each other.
-      relieved: how many answers of each answerer cease to be violated where the margin becomes positive, less those
-        that begin to be; zero where an earlier answer is about the same margin up to a factor, and counts for both.
+      relieved: how many answers of each answerer cease to be violated where the margin grows past the wall, less those
+        that begin to be; zero in padding, and where an earlier answer has the same wall, which counts for both.
+      margins, places: which margin each wall is of, and where; None: one of each, at zero.
     """
 
     normals: Float[Array, "c q"]
     products: Float[Array, "c c"]
-    relieved: Float[Array, "c a"]
+    relieved: Float[Array, "w a"]
+    margins: Int[Array, " w"] | None = None
+    places: Float[Array, " w"] | None = None
+
+    def at(self, threshold: Float[Array, ""]) -> "Walls":
+        """The walls where those of ties are given in units of this threshold."""
+        return self if self.places is None else self._replace(places=self.places * threshold)
 
 
 class _Flight(NamedTuple):
@@ -67,13 +74,32 @@ def walls_of(
     answerers: Float[np.ndarray, "a c"],
     *,
     prior_scale: float,
+    indifferent: Bool[np.ndarray, " k"] | None = None,
 ) -> Walls:
-    """The walls of answers in padded arrays; `groups` have the rows about one margin each, and their ratios to it."""
-    normals, relieved = prior_scale * loadings, np.zeros(answerers.T.shape)
+    """The walls of answers in padded arrays; `groups` have the rows about one margin each, and their ratios to it.
+
+    `indifferent` tells the ties, of which each has a wall on either side; None: there are none, nor a threshold.
+    """
+    normals, there = prior_scale * loadings, np.any(loadings != 0, axis=1)
+    products, relieved = normals @ normals.T, np.zeros(answerers.T.shape)
+    if indifferent is None:
+        for rows, ratios in groups:
+            relieved[rows[0]] = answerers[:, rows] @ np.sign(ratios)
+        relieved[~there] = 0.0
+        return Walls(*map(jnp.asarray, (normals, products, relieved)))
+    walls: dict[tuple[int, float], Float[np.ndarray, " a"]] = {}
     for rows, ratios in groups:
-        relieved[rows[0]] = answerers[:, rows] @ np.sign(ratios)
-    relieved[~np.any(loadings != 0, axis=1)] = 0.0
-    return Walls(*map(jnp.asarray, (normals, normals @ normals.T, relieved)))
+        for row, ratio in zip(rows, ratios, strict=True):
+            sides = (-1.0, 1.0) if indifferent[row] else (np.sign(ratio),)
+            for side in sides if there[row] else ():
+                wall = int(rows[0]), float(np.round(side / abs(ratio), 9))
+                # a tie is obeyed between its walls
+                relief = -side if indifferent[row] else side
+                walls[wall] = walls.get(wall, 0.0) + relief * answerers[:, row]
+    pad = 2 * len(normals) - len(walls)
+    margins, places = np.array([*walls, *[(0, 0.0)] * pad]).T
+    relieved = np.array([*walls.values(), *[np.zeros(len(answerers))] * pad])
+    return Walls(*map(jnp.asarray, (normals, products, relieved, margins.astype(int), places)))
 
 
 def flown(
@@ -94,39 +120,39 @@ def flown(
       violated: answers of each answerer at the start.
       heights: log likelihood by the number of violated answers, for each answerer.
     """
-    number, squares = len(walls.normals), jnp.diagonal(walls.products)
-    there, each = jnp.any(walls.relieved != 0, axis=1) & (squares > 0), jnp.arange(len(heights))
+    number, squares = len(walls.relieved), jnp.diagonal(walls.products)
+    of = jnp.arange(number) if walls.margins is None else walls.margins
+    there, each = jnp.any(walls.relieved != 0, axis=1) & (squares[of] > 0), jnp.arange(len(heights))
 
     def to_next_wall(now: _Flight) -> _Flight:
-        # Pakman & Paninski (2014): t cos s + u sin s is zero where cot s = −u/t: the next wall is that of the largest
-        cotangents = jnp.where(there & (jnp.arange(number) != now.last), -now.speeds / now.margins, -jnp.inf)
+        cotangents = jnp.where(there, _cotangents(now, walls), -jnp.inf)
         # two reductions, because the compiler makes a slow loop of argmax
         wall = jnp.min(jnp.where(cotangents == jnp.max(cotangents), jnp.arange(number), number - 1))
-        angle = jnp.arctan2(1.0, cotangents[wall])
+        angle, margin = jnp.arctan2(1.0, cotangents[wall]), of[wall]
         met = angle < DURATION - now.time
         angle = jnp.where(met, angle, DURATION - now.time)
         time = jnp.where(met, now.time + angle, DURATION)
         cos, sin = jnp.cos(angle), jnp.sin(angle)
-        speed = now.speeds[wall] * cos - now.margins[wall] * sin
+        speed = now.speeds[margin] * cos - now.margins[margin] * sin
         beyond = now.violated - jnp.sign(speed) * walls.relieved[wall]
         gain = jnp.sum(heights[each, beyond.astype(int)] - heights[each, now.violated.astype(int)])
         # Afshar & Domke (2015): through with the speed that is left, or reflected where none is
-        square = speed**2 + 2 * squares[wall] * gain
+        square = speed**2 + 2 * squares[margin] * gain
         through = square > 0
         after = jnp.where(through, jnp.sign(speed) * jnp.sqrt(jnp.maximum(square, 0)), -speed)
-        kick = jnp.where(met, (after - speed) / squares[wall], 0.0)
+        kick = jnp.where(met, (after - speed) / squares[margin], 0.0)
         return _Flight(
             now.margins * cos + now.speeds * sin,
-            now.speeds * cos - now.margins * sin + kick * walls.products[wall],
+            now.speeds * cos - now.margins * sin + kick * walls.products[margin],
             jnp.where(met & through, beyond, now.violated),
             time,
             jnp.where(met, wall, now.last),
             now.events + met,
-            now.kicks.at[wall].add(kick * jnp.stack([-jnp.sin(time), jnp.cos(time)])),
+            now.kicks.at[margin].add(kick * jnp.stack([-jnp.sin(time), jnp.cos(time)])),
         )
 
     zero = jnp.zeros((), int)
-    kicks = jnp.zeros((number, 2), y.dtype)
+    kicks = jnp.zeros((len(walls.normals), 2), y.dtype)
     start = _Flight(margins, walls.normals @ velocity, violated, jnp.zeros((), y.dtype), zero - 1, zero, kicks)
     most = MOST_EVENTS * number
     end = lax.while_loop(lambda now: (now.time < DURATION) & (now.events < most), to_next_wall, start)
@@ -134,6 +160,23 @@ def flown(
     cos, sin = np.cos(DURATION), np.sin(DURATION)
     # Pakman & Paninski (2014): the motion under a standard normal distribution is a rotation
     return position * cos + velocity * sin, velocity * cos - position * sin, end.time < DURATION
+
+
+def _cotangents(now: _Flight, walls: Walls) -> Float[Array, " w"]:
+    """Of the angle until the flight meets each wall again; −∞ for those that it does not meet in half a period."""
+    number = jnp.arange(len(walls.relieved))
+    if walls.margins is None or walls.places is None:
+        # Pakman & Paninski (2014): t cos s + u sin s is zero where cot s = −u/t: the next wall is that of the largest
+        return jnp.where(number != now.last, -now.speeds / now.margins, -jnp.inf)
+    # it is c where x = tan s/2 solves (c + t) x² − 2u x + c − t = 0; at the wall itself x = 0 is one of the solutions
+    t, u, c = now.margins[walls.margins], now.speeds[walls.margins], walls.places
+    square = u**2 + t**2 - c**2
+    q = u + jnp.where(u < 0, -1, 1) * jnp.sqrt(jnp.maximum(square, 0))
+    one, other = q / (c + t), (c - t) / q
+    nearest = jnp.minimum(jnp.where(one > 0, one, jnp.inf), jnp.where(other > 0, other, jnp.inf))
+    again = jnp.where(u / c > 0, u / c, jnp.inf)
+    x = jnp.where(number == now.last, again, jnp.where(square >= 0, nearest, jnp.inf))
+    return jnp.where(x < jnp.inf, (1 / x - x) / 2, -jnp.inf)
 
 
 def flight_move(

@@ -1,6 +1,7 @@
 """Moves of weights and lapse rates where the likelihood has steps and there are many answers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax, random
 from jax.scipy.special import logsumexp
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from bayespbrl.models.coordinate_sweep import Sweep, sweep_move, sweep_of
 from bayespbrl.models.expectation_propagation import same_margins
@@ -23,8 +24,9 @@ from bayespbrl.models.gibbs import (
     point_of,
 )
 from bayespbrl.models.lapse_transport import Ladder, ladder_of, transported
-from bayespbrl.models.likelihoods import log_prob
+from bayespbrl.models.likelihoods import log_prob, ties_of
 from bayespbrl.models.refraction import Walls, flight_move, walls_of
+from bayespbrl.models.tempering import walked
 
 # Dimensions from which few answers decide about each, so that the lapse rate takes the weights along.
 MANY_DIMENSIONS = 64
@@ -33,7 +35,17 @@ FLIGHTS = 12
 BESIDE = 1e-300  # a margin on one side of the step
 
 
-_InFlight = tuple[Float[Array, " q"], Float[Array, " c"], Bool[Array, ""]]  # y, its margins, whether one was given up
+class _Walker(NamedTuple):
+    """What flights move.
+
+    Attributes:
+      y, margins: weights whitened by the prior, and theirs.
+      threshold: number of the tie threshold.
+    """
+
+    y: Float[Array, " q"]
+    margins: Float[Array, " c"]
+    threshold: Int[Array, ""]
 
 
 class Steps(NamedTuple):
@@ -44,12 +56,15 @@ class Steps(NamedTuple):
       heights: log likelihood by the number of violated answers of each answerer, with the lapse rate summed out.
       ladder: of each setting, stacked; None: lapse rates move alone.
       sweep: through the weights, where few answers touch each, in many dimensions and one setting; else None.
+        None of it with ties.
+      tempered: (), a marker that is part of what is compiled, where each draw has a tempered walk too; else None.
     """
 
     walls: Walls
     heights: Float[Array, "a n"]
     ladder: Ladder | None
     sweep: Sweep | None
+    tempered: tuple[()] | None = None
 
 
 def steps_of(fits: Sequence[GaussianFit], problem: JointProblem) -> Steps:
@@ -57,12 +72,18 @@ def steps_of(fits: Sequence[GaussianFit], problem: JointProblem) -> Steps:
     loadings, answerers = np.asarray(problem.settings.loadings), np.asarray(problem.answerers)
     scale = fits[0].model.prior_scale
     groups = [same_margins(fit.factors.loadings) for fit in fits]
-    walls = [walls_of(rows, same, answerers, prior_scale=scale) for rows, same in zip(loadings, groups, strict=True)]
-    moving = len(problem.lapse_rate.values) > 1 and loadings.shape[2] > MANY_DIMENSIONS
+    ties = ties_of(fits[0].likelihood)
+    tied = None if ties is None else np.asarray(ties.indifferent)
+    walls = [
+        walls_of(rows, same, answerers, prior_scale=scale, indifferent=tied)
+        for rows, same in zip(loadings, groups, strict=True)
+    ]
+    wide = loadings.shape[2] > MANY_DIMENSIONS and ties is None
+    moving = len(problem.lapse_rate.values) > 1 and wide
     ranks = [fit.factors.loadings.shape[1] for fit in fits] if moving else []
     ladders = [ladder_of(scale * rows, rank) for rows, rank in zip(loadings, ranks, strict=False)]
     sweep = None
-    if len(fits) == 1 and loadings.shape[2] > MANY_DIMENSIONS:
+    if len(fits) == 1 and wide:
         sweep = sweep_of(
             fits[0].differences, fits[0].factors.basis, answerers, prior_scale=scale, rank=loadings.shape[2]
         )
@@ -79,46 +100,117 @@ def step_moves(
     """
     y = z / problem.settings.prior_scale
     walls = at_setting(steps.walls, unknowns.setting)
-    margins = walls.normals @ y
+    now, total = _Walker(y, walls.normals @ y, unknowns.tie_threshold), partial(_total, problem, unknowns)
 
-    def lapse_weights(margins: Float[Array, " c"]) -> Float[Array, "a v"]:
-        every = point_of(problem, unknowns)._replace(lapse_rate=problem.lapse_rate.values[:, None])
-        log_p = jnp.atleast_2d(log_probabilities(problem, every, margins))  # one row where no answer can be a lapse
-        return problem.answerers @ log_p.T + problem.lapse_rate.log_probabilities
-
-    def total(margins: Float[Array, " c"]) -> Float[Array, ""]:
-        return jnp.sum(logsumexp(lapse_weights(margins), axis=1))
-
-    def flight(now: _InFlight, key: PRNGKeyArray) -> tuple[_InFlight, None]:
-        y, margins, given_up = now
-        y, margins, this_given_up = flight_move(
-            key,
-            y,
-            walls,
-            margins=margins,
-            violated=problem.answerers @ (margins < 0),
-            heights=steps.heights,
-            log_likelihood=total,
-        )
-        return (y, margins, given_up | this_given_up), None
+    def flight(
+        before: tuple[_Walker, Bool[Array, ""]], key: PRNGKeyArray
+    ) -> tuple[tuple[_Walker, Bool[Array, ""]], None]:
+        now, given_up = before
+        now, this_given_up = _flown(key, now, problem, walls, heights=steps.heights, log_likelihood=total)
+        return (now, given_up | this_given_up), None
 
     if steps.sweep is not None:
         key_sweep, key = random.split(key)
         y, margins = sweep_move(
-            key_sweep, y, margins, steps.sweep, normals=walls.normals, heights=steps.heights, log_likelihood=total
+            key_sweep,
+            now.y,
+            now.margins,
+            steps.sweep,
+            normals=walls.normals,
+            heights=steps.heights,
+            log_likelihood=total,
         )
-    keys, now = random.split(key, 3), (y, margins, jnp.zeros((), bool))
+        now = now._replace(y=y, margins=margins)
+    if steps.tempered is not None:
+        key_tempered, key = random.split(key)
+        now = _tempered_move(key_tempered, now, unknowns, problem, steps)
+        unknowns = unknowns._replace(tie_threshold=now.threshold)
+        total = partial(_total, problem, unknowns)
+    keys, start = random.split(key, 3), (now, jnp.zeros((), bool))
     if steps.ladder is None or steps.sweep is not None:
-        now, _ = flight(now, keys[0])
+        (now, given_up), _ = flight(start, keys[0])
     else:
-        now, _ = lax.scan(flight, now, random.split(keys[0], FLIGHTS))
-    y, margins, given_up = now
+        (now, given_up), _ = lax.scan(flight, start, random.split(keys[0], FLIGHTS))
+    y, margins = now.y, now.margins
     if len(problem.lapse_rate.values) > 1:
-        unknowns = unknowns._replace(lapse_rate=random.categorical(keys[1], lapse_weights(margins)))
+        weights = _lapse_weights(problem, unknowns, margins)
+        unknowns = unknowns._replace(lapse_rate=random.categorical(keys[1], weights))
     if steps.ladder is not None:
         ladder = at_setting(steps.ladder, unknowns.setting)
         y, unknowns = _transport_move(keys[2], y, margins, unknowns, problem, walls, ladder)
     return y * problem.settings.prior_scale, unknowns, given_up
+
+
+def _flown(
+    key: PRNGKeyArray,
+    now: _Walker,
+    problem: JointProblem,
+    walls: Walls,
+    *,
+    heights: Float[Array, "a n"],
+    log_likelihood: Callable[[Float[Array, " c"]], Float[Array, ""]],
+) -> tuple[_Walker, Bool[Array, ""]]:
+    """After one flight, and whether it was given up."""
+    threshold = problem.tie_threshold.values[now.threshold]
+    y, margins, given_up = flight_move(
+        key,
+        now.y,
+        walls.at(threshold),
+        margins=now.margins,
+        violated=problem.answerers @ _violated(problem, threshold, now.margins),
+        heights=heights,
+        log_likelihood=log_likelihood,
+    )
+    return now._replace(y=y, margins=margins), given_up
+
+
+def _lapse_weights(problem: JointProblem, unknowns: Unknowns, margins: Float[Array, " c"]) -> Float[Array, "a v"]:
+    """log probability of each lapse rate of each answerer, and of the answers with it."""
+    every = point_of(problem, unknowns)._replace(lapse_rate=problem.lapse_rate.values[:, None])
+    log_p = jnp.atleast_2d(log_probabilities(problem, every, margins))  # one row where no answer can be a lapse
+    return problem.answerers @ log_p.T + problem.lapse_rate.log_probabilities
+
+
+def _total(problem: JointProblem, unknowns: Unknowns, margins: Float[Array, " c"]) -> Float[Array, ""]:
+    """log probability of the answers, with the lapse rates summed out."""
+    return jnp.sum(logsumexp(_lapse_weights(problem, unknowns, margins), axis=1))
+
+
+def _tempered_move(
+    key: PRNGKeyArray, start: _Walker, unknowns: Unknowns, problem: JointProblem, steps: Steps
+) -> _Walker:
+    """After a tempered walk of the weights and the tie threshold: at each level a flight, and a draw of that."""
+    walls, (thresholds, log_prior) = at_setting(steps.walls, unknowns.setting), problem.tie_threshold
+
+    def flight(key: PRNGKeyArray, now: _Walker, share: Float[Array, ""]) -> _Walker:
+        height = partial(_height, problem, share * steps.heights, thresholds[now.threshold])
+        return _flown(key, now, problem, walls, heights=share * steps.heights, log_likelihood=height)[0]
+
+    def redrawn(key: PRNGKeyArray, now: _Walker, share: Float[Array, ""]) -> _Walker:
+        if len(thresholds) == 1:
+            return now
+        each = jax.vmap(_height, (None, None, 0, None))(problem, steps.heights, thresholds, now.margins)
+        return now._replace(threshold=random.categorical(key, share * each + log_prior))
+
+    def height(now: _Walker) -> Float[Array, ""]:
+        return _height(problem, steps.heights, thresholds[now.threshold], now.margins)
+
+    def besides(now: _Walker) -> Float[Array, ""]:
+        """What the likelihood has besides the heights."""
+        return _total(problem, unknowns._replace(tie_threshold=now.threshold), now.margins) - height(now)
+
+    key_walk, key_test = random.split(key)
+    end, gained = walked(key_walk, start, (flight, redrawn), height)
+    accepted = jnp.log(random.uniform(key_test)) < gained + besides(end) - besides(start)
+    return jax.tree.map(lambda old, new: jnp.where(accepted, new, old), start, end)
+
+
+def _height(
+    problem: JointProblem, heights: Float[Array, "a n"], threshold: Float[Array, ""], margins: Float[Array, " c"]
+) -> Float[Array, ""]:
+    """The heights' sum over the answerers."""
+    violated = problem.answerers @ _violated(problem, threshold, margins)
+    return jnp.sum(heights[jnp.arange(len(violated)), violated.astype(int)])
 
 
 def _transport_move(
@@ -158,14 +250,29 @@ def _beside(problem: JointProblem, point: Point) -> Float[Array, "2 *b c"]:
     return jnp.exp(jnp.stack([log_prob(likelihood, jnp.full(shape, sign * BESIDE)) for sign in (1, -1)]))
 
 
+def _violated(problem: JointProblem, threshold: Float[Array, ""], margins: Float[Array, " c"]) -> Bool[Array, " c"]:
+    """Which answers their margins contradict."""
+    ties = ties_of(problem.settings.likelihood)
+    if ties is None:
+        return margins < 0
+    return jnp.where(ties.indifferent, jnp.abs(margins) > threshold, margins < threshold)
+
+
 def _heights(problem: JointProblem) -> Float[Array, "a n"]:
-    """Log likelihood of each number of violated answers of each answerer, all margins near zero, without lapse rate."""
+    """Log likelihood of each number of violated answers of each answerer, all margins near zero, without lapse rate.
+
+    Ties count as answers that order. By what they differ, the smooth part of eq. 8, is left to the Metropolis tests.
+    """
     rates = problem.lapse_rate.values
-    point = Point(
-        problem.steepness.values[0], rates, problem.tie_threshold.values[0]
-    )  # half at zero with any steepness
+    # half at zero with any steepness
+    point = Point(problem.steepness.values[0], rates, problem.tie_threshold.values[0])
     likelihood = likelihood_with(problem.settings.likelihood, point)
-    right, wrong = (log_prob(likelihood, jnp.full(rates.shape, sign * BESIDE)) for sign in (1, -1))
+    beside = [jnp.full(rates.shape, sign * BESIDE) for sign in (1, -1)]
+    if (ties := ties_of(likelihood)) is None:
+        right, wrong = (log_prob(likelihood, margins) for margins in beside)
+    else:
+        attentive = (jnp.exp(log_prob(ties.ordered, margins)) for margins in beside)
+        right, wrong = (jnp.log(rates / 3 + (1 - rates) * each) for each in attentive)
     given, violated = jnp.sum(problem.answerers, axis=1), jnp.arange(problem.answerers.shape[1] + 1)
     obeyed = given[:, None] - violated
     # eq. 8 at margins near zero, and the prior of λ
