@@ -18,6 +18,7 @@ from bayespbrl import Learner, ReturnExpert, collection, cycle, rollouts
 from bayespbrl.envs import opening
 from bayespbrl.events import answered
 from bayespbrl.improvement.check import CLEARLY, Check, share_better
+from bayespbrl.improvement.problem import recent
 from bayespbrl.policies import greedy
 from bayespbrl.policies.actor import Actor
 from bayespbrl.rollouts import rollout
@@ -163,6 +164,20 @@ def test_after_the_last_answer_a_policy_is_started_anew(run, restarted):
     checks = [summary["check"] for summary in restarted.iterations[began:]]
     assert [check["best"] for check in checks[:2]] == [began, began + 1]
     assert restart.kept.number == restarted.iterations[began - 1]["kept"]
+
+
+def test_after_a_restart_policies_improve_by_the_trajectories_since_then(restarted, monkeypatch):
+    state, cycle_, taken = restarted.learner.state, restarted.learner.cycle, []
+
+    def recorded(trajectories, *known, **options):
+        taken.append(len(trajectories))
+        return recent(trajectories, *known, **options)
+
+    monkeypatch.setattr(cycle, "recent", recorded)
+    cycle_.update(state, state.estimate, None)
+    assert state.started > 0
+    before = state.started * restarted.learner.settings.rollouts.trajectories_per_iteration
+    assert taken == [len(state.trajectories) - before]
 
 
 def test_after_a_restart_the_kept_policy_gives_way_only_to_a_clearly_better_one(restarted):

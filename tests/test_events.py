@@ -124,6 +124,7 @@ def test_a_policy_is_started_anew_once_and_what_was_kept_is_remembered():
     first, kept = NumberedPolicy(2, "policy 0"), NumberedPolicy(2, "policy 2")
     assert (state.newest, state.best, state.started, state.trust) == (first, first, 2, 1.0)
     assert (state.kept, state.restart) == (kept, Restart(2, kept))
+    assert apply(dataclasses.replace(replay(START, HISTORY), trust=0.25), anew).trust == 1.0
     checked = {"check": {"best": 2, "trust": 1.0}}
     for kept, policy in ((3, "policy 3"), (2, "policy 2")):
         update = improved(3)

@@ -16,7 +16,7 @@ from bayespbrl.models.coordinate_sweep import forth_and_back, sweep_move, sweep_
 from bayespbrl.models.gaussian_fit import refitted
 from bayespbrl.models.likelihoods import likelihood_of, log_prob, prob
 from bayespbrl.models.posterior import Answers, SamplerOptions, posterior_draws
-from bayespbrl.models.preference_problem import padded_problem
+from bayespbrl.models.preference_problem import padded_problem, reference_ellipse
 from bayespbrl.models.split_dynamics import split_move
 from bayespbrl.models.tempering import SHARES, walked
 
@@ -445,6 +445,34 @@ def test_sweeps_are_made_where_few_answers_touch_a_weight_and_few_weights_an_ans
     rows = np.kron(np.eye(20), np.ones((answers_each, weights_each)))
     sweep = sweep_of(rows, np.eye(rows.shape[1]), np.ones((1, len(rows))), prior_scale=1.0, rank=rows.shape[1])
     assert (sweep is not None) == swept
+
+
+@pytest.mark.parametrize("width", [None, 0.6])
+def test_the_residual_of_a_reference_is_what_the_posterior_has_beside_it(width):
+    rows = answers(8, seed=5)
+    fit = fit_gaussian(rows, PreferenceModel(0.8, 1.0, 0.2, "logistic"))
+    precisions = fit.approximation.site_precisions
+    with jax.enable_x64(True):
+        problem = padded_problem(
+            rows,
+            fit.likelihood,
+            prior_scale=0.8,
+            mean=fit.factors.basis @ fit.approximation.mean,
+            site_precisions=precisions,
+        )
+        root = np.asarray(problem.root[:2, :2])
+        if width is not None:
+            excess = (1 / width**2 - 1) / 0.8**2
+            site_precisions = problem.site_precisions / width**2
+            problem = problem._replace(site_precisions=site_precisions, excess=excess, width=width)
+        ellipse, points = reference_ellipse(problem), np.random.default_rng(0).normal(size=(50, 2))
+        each = np.pad(points, ((0, 0), (0, problem.loadings.shape[1] - 2)))
+        residuals = np.array([ellipse.residual(ellipse.lift(jnp.asarray(z))[None])[0] for z in each])
+    covariance = root @ root.T * (1.0 if width is None else width**2)
+    reference = stats.multivariate_normal(np.asarray(problem.centre)[:2], covariance).logpdf(points)
+    likelihood = likelihood_of("logistic", 8.0, steepness=1.0, lapse_rate=0.2)
+    posterior = np.log(prob(likelihood, points @ rows.T)).sum(axis=1) - 0.5 * np.sum(points**2, axis=1) / 0.8**2
+    np.testing.assert_allclose(np.diff(residuals), np.diff(posterior - reference), atol=1e-9)
 
 
 @pytest.mark.parametrize("width", [1.0, 0.6])

@@ -5,8 +5,10 @@ from scipy.special import expit, ndtr
 
 from bayespbrl.diagnostics import answer_probabilities, prequential_predictions
 from bayespbrl.diagnostics.predictions import held_out_probabilities, refit
-from bayespbrl.models import Answers, PreferenceModel, sample_posterior
+from bayespbrl.models import Answers, PreferenceModel, posterior_draws, sample_posterior
 from bayespbrl.models.low_rank import low_rank
+from bayespbrl.models.posterior import SamplerOptions
+from bayespbrl.models.posterior_tree import next_lapse_rates
 
 SAMPLING = {"num_warmup": 100, "num_samples": 400, "max_samples": 400}
 SAMPLE = ("chain", "draw")
@@ -186,3 +188,11 @@ def test_answers_with_sides_are_predicted_one_after_the_other():
     assert predicted[0] == pytest.approx(0.5, abs=0.02)  # nothing is known yet
     assert predicted[1] < 0.45  # the second shown is the better one, as Ada said
     assert predicted[2] > 0.55
+
+
+def test_the_next_answer_is_by_anybody_in_proportion_to_their_answers_so_far():
+    rows, who = np.random.default_rng(0).normal(size=(5, 2)), np.array([0, 1, 1, 1, 1])
+    model, few = PreferenceModel(lapse_rate=None), SamplerOptions(25, 25, 25)
+    tree = posterior_draws(rows, model, seed=0, answers=Answers(answerers=who), sampler=few)
+    rates = tree["posterior/lapse_rate"].values
+    np.testing.assert_allclose(next_lapse_rates(tree), 0.2 * rates[..., 0] + 0.8 * rates[..., 1])

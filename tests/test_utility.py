@@ -48,6 +48,13 @@ def test_the_answers_are_explained(method):
     assert estimate.quality.converged
 
 
+@pytest.mark.parametrize("tie", [(0, 1), (1, 0)])
+def test_a_tie_is_no_pair_that_the_utility_could_satisfy(tie):
+    comparisons = Comparisons.among(TRAJECTORIES, PAIRS[:1], ties=[tie], discount=0.9)
+    estimate = inference.estimate(comparisons, ONE_HOT, inference.Estimation(), PreferenceModel(), seed=0)
+    assert (estimate.quality.pairs, estimate.quality.pairs_satisfied) == (1, 1)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_a_trajectorys_utility_is_the_discounted_sum_of_its_steps(method):
     estimate = estimate_utility(TRAJECTORIES, PAIRS, ONE_HOT, method=method, discount=0.9)
