@@ -107,37 +107,8 @@ def moves_among_steps(monkeypatch, kind):
         monkeypatch.setattr(step_moves, "sweep_of", lambda *_, **__: None)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["flights", "transport", "sweeps"])
-def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterior_of_quadrature(kind, monkeypatch):
-    moves_among_steps(monkeypatch, kind)
-    rows = answers(12, seed=7)
-    rows = np.concatenate([rows, -0.5 * rows[:1], 2 * rows[1:2]])  # a wall of two answers for each of two
-    fit = fit_gaussian(rows, PreferenceModel(steepness=None, lapse_rate=None))
-    with jax.enable_x64(True):
-        chains = Chains.start([fit], num_chains=8, chunk=25, seed=0)
-        problem, steps = chains.problem, step_moves.steps_of([fit], chains.problem)
-        assert [steps.ladder is not None, steps.sweep is not None] == [kind != "flights", kind == "sweeps"]
-
-        def step(state, _):
-            *state, _ = flight_draw(*state, problem, steps)
-            return tuple(state), (state[0].z["utility_weights"][:2], state[1])
-
-        def chain(state, unknowns):
-            return jax.lax.scan(step, (state, unknowns), None, length=1500)[1]
-
-        z, unknowns = jax.jit(jax.vmap(chain))(chains.state, chains.unknowns)
-        log_m = np.log(np.asarray(problem.steepness.values))[np.asarray(unknowns.steepness)]
-        lapse_rate = np.asarray(problem.lapse_rate.values)[np.asarray(unknowns.lapse_rate)]
-    draws = np.concatenate([np.asarray(z) @ fit.factors.basis.T, log_m[..., None], lapse_rate], axis=2)[:, 50:]
-    expected, _ = quadrature(rows, "mixed")
-    error = chain_convergence(draws).monte_carlo_error
-    assert np.all(np.abs(draws.mean(axis=(0, 1)) - expected) < 4 * error)
-    assert np.all(error < 0.035 * draws.std(axis=(0, 1)))
-
-
 def flights(fit, length, *, tempered, alone=False):
-    """Weights and unknowns of eight chains by `step_moves`, and by the other moves of a draw unless it is `alone`."""
+    """Weights, unknowns and steps of eight chains: `step_moves`, and the other moves of a draw unless it is `alone`."""
     with jax.enable_x64(True):
         chains = Chains.start([fit], num_chains=8, chunk=25, seed=0)
         problem, steps = chains.problem, step_moves.steps_of([fit], chains.problem)
@@ -160,7 +131,23 @@ def flights(fit, length, *, tempered, alone=False):
         z, unknowns = jax.jit(jax.vmap(chain))(chains.state, chains.unknowns)
     grids = {name: getattr(problem, name).values for name in ("lapse_rate", "steepness", "tie_threshold")}
     drawn = {name: np.asarray(grid)[np.asarray(getattr(unknowns, name))] for name, grid in grids.items()}
-    return np.asarray(z) @ fit.factors.basis.T, drawn
+    return np.asarray(z) @ fit.factors.basis.T, drawn, steps
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["flights", "transport", "sweeps", "tempered"])
+def test_flights_and_lapse_rates_that_take_the_weights_along_sample_the_posterior_of_quadrature(kind, monkeypatch):
+    moves_among_steps(monkeypatch, "flights" if kind == "tempered" else kind)
+    rows = answers(12, seed=7)
+    rows = np.concatenate([rows, -0.5 * rows[:1], 2 * rows[1:2]])  # a wall of two answers for each of two
+    fit = fit_gaussian(rows, PreferenceModel(steepness=None, lapse_rate=None))
+    weights, drawn, steps = flights(fit, 1500, tempered=kind == "tempered")
+    assert [steps.ladder is not None, steps.sweep is not None] == [kind in ("transport", "sweeps"), kind == "sweeps"]
+    draws = np.concatenate([weights, np.log(drawn["steepness"])[..., None], drawn["lapse_rate"]], axis=2)[:, 50:]
+    expected, _ = quadrature(rows, "mixed")
+    error = chain_convergence(draws).monte_carlo_error
+    assert np.all(np.abs(draws.mean(axis=(0, 1)) - expected) < 4 * error)
+    assert np.all(error < 0.035 * draws.std(axis=(0, 1)))
 
 
 @pytest.mark.slow
@@ -173,24 +160,11 @@ def test_flights_among_ties_sample_the_posterior_of_quadrature(kind):
     fit = fit_gaussian(rows, PreferenceModel(lapse_rate=None), indifferent=tied)
     # by walks alone the threshold moves too
     length = 5000 if kind == "tempered alone" else 2000
-    weights, drawn = flights(fit, length, tempered=kind != "flights", alone=kind == "tempered alone")
+    weights, drawn, _ = flights(fit, length, tempered=kind != "flights", alone=kind == "tempered alone")
     draws = [weights, np.log(drawn["tie_threshold"])[..., None], drawn["lapse_rate"]]
     draws = np.concatenate(draws, axis=2)[:, 50:]
     error = chain_convergence(draws).monte_carlo_error
     assert np.all(np.abs(draws.mean(axis=(0, 1)) - quadrature_with_ties(rows, tied)) < 4 * error)
-    assert np.all(error < 0.035 * draws.std(axis=(0, 1)))
-
-
-@pytest.mark.slow
-def test_tempered_walks_without_ties_sample_the_posterior_of_quadrature():
-    rows = answers(14, seed=7)
-    fit = fit_gaussian(rows, PreferenceModel(steepness=None, lapse_rate=None))
-    weights, drawn = flights(fit, 1500, tempered=True)
-    draws = [weights, np.log(drawn["steepness"])[..., None], drawn["lapse_rate"]]
-    draws = np.concatenate(draws, axis=2)[:, 50:]
-    expected, _ = quadrature(rows, "mixed")
-    error = chain_convergence(draws).monte_carlo_error
-    assert np.all(np.abs(draws.mean(axis=(0, 1)) - expected) < 4 * error)
     assert np.all(error < 0.035 * draws.std(axis=(0, 1)))
 
 
@@ -210,10 +184,10 @@ def test_flights_among_ties_keep_the_energy_of_steps():
 
         def flight(y, velocity, number):
             threshold = problem.tie_threshold.values[number]
-            violated = problem.answerers @ step_moves._violated(problem, threshold, normals @ y)
+            violated = step_moves._violated(problem, threshold, normals @ y)
             known = {"margins": normals @ y, "violated": violated, "heights": steps.heights}
             end, at_end, given_up = refraction.flown(y, velocity, walls.at(threshold), **known)
-            there = problem.answerers @ step_moves._violated(problem, threshold, normals @ end)
+            there = step_moves._violated(problem, threshold, normals @ end)
             return energy(end, at_end, threshold) - energy(y, velocity, threshold), given_up, (there != violated)[0]
 
         start = rng.normal(size=(2, 500, rank)) * (np.arange(rank) < 2)
@@ -447,29 +421,37 @@ def test_sweeps_are_made_where_few_answers_touch_a_weight_and_few_weights_an_ans
     assert (sweep is not None) == swept
 
 
+def with_reference(rows, fit, *, share=1.0):
+    """The problem of two weights without padding, whose reference has such a share of the answers' Gaussian factors."""
+    problem = padded_problem(
+        rows,
+        fit.likelihood,
+        prior_scale=fit.model.prior_scale,
+        mean=fit.factors.basis @ fit.approximation.mean,
+        site_precisions=share * fit.approximation.site_precisions,
+    )
+    return problem._replace(
+        loadings=problem.loadings[:, :2],
+        centre=problem.centre[:2],
+        root=problem.root[:2, :2],
+        inverse_root=problem.inverse_root[:2, :2],
+    )
+
+
 @pytest.mark.parametrize("width", [None, 0.6])
 def test_the_residual_of_a_reference_is_what_the_posterior_has_beside_it(width):
     rows = answers(8, seed=5)
     fit = fit_gaussian(rows, PreferenceModel(0.8, 1.0, 0.2, "logistic"))
-    precisions = fit.approximation.site_precisions
     with jax.enable_x64(True):
-        problem = padded_problem(
-            rows,
-            fit.likelihood,
-            prior_scale=0.8,
-            mean=fit.factors.basis @ fit.approximation.mean,
-            site_precisions=precisions,
-        )
-        root = np.asarray(problem.root[:2, :2])
+        problem = with_reference(rows, fit)
         if width is not None:
             excess = (1 / width**2 - 1) / 0.8**2
             site_precisions = problem.site_precisions / width**2
             problem = problem._replace(site_precisions=site_precisions, excess=excess, width=width)
         ellipse, points = reference_ellipse(problem), np.random.default_rng(0).normal(size=(50, 2))
-        each = np.pad(points, ((0, 0), (0, problem.loadings.shape[1] - 2)))
-        residuals = np.array([ellipse.residual(ellipse.lift(jnp.asarray(z))[None])[0] for z in each])
-    covariance = root @ root.T * (1.0 if width is None else width**2)
-    reference = stats.multivariate_normal(np.asarray(problem.centre)[:2], covariance).logpdf(points)
+        residuals = np.array([ellipse.residual(ellipse.lift(jnp.asarray(z))[None])[0] for z in points])
+    root = np.asarray(problem.root) * (1.0 if width is None else width)
+    reference = stats.multivariate_normal(np.asarray(problem.centre), root @ root.T).logpdf(points)
     likelihood = likelihood_of("logistic", 8.0, steepness=1.0, lapse_rate=0.2)
     posterior = np.log(prob(likelihood, points @ rows.T)).sum(axis=1) - 0.5 * np.sum(points**2, axis=1) / 0.8**2
     np.testing.assert_allclose(np.diff(residuals), np.diff(posterior - reference), atol=1e-9)
@@ -482,19 +464,7 @@ def test_split_dynamics_leave_the_posterior_as_it_is(width):
     model = PreferenceModel(1.0, steepness, lapse_rate, "logistic")
     fit = fit_gaussian(rows, model)
     with jax.enable_x64(True):
-        problem = padded_problem(
-            rows,
-            fit.likelihood,
-            prior_scale=1.0,
-            mean=fit.factors.basis @ fit.approximation.mean,
-            site_precisions=0.3 * fit.approximation.site_precisions,
-        )
-        problem = problem._replace(
-            loadings=problem.loadings[:, :2],
-            centre=problem.centre[:2],
-            root=problem.root[:2, :2],
-            inverse_root=problem.inverse_root[:2, :2],
-        )
+        problem = with_reference(rows, fit, share=0.3)
 
         def step(z, key):
             scaled = problem.site_precisions / width**2

@@ -22,6 +22,7 @@ from jax.scipy.special import ndtri
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from bayespbrl.models.preference_problem import padded_size
+from bayespbrl.models.refraction import at_violated
 
 # A weight that more answers touch is not drawn here. None is, where these are too large a part of all, or where an
 # answer touches more of the others.
@@ -150,7 +151,7 @@ def sweep_move(
     def besides(state: _State) -> Float[Array, ""]:
         """What the likelihood has besides the heights."""
         _, margins, violated = state
-        return log_likelihood(margins) - jnp.sum(_at(heights, violated))
+        return log_likelihood(margins) - jnp.sum(at_violated(heights, violated))
 
     state = (start, margins, answerers @ (margins < 0))
     (weights, *_), _ = lax.scan(next_round, state, random.split(key_rounds, max(1, len(y) // COORDINATES)))
@@ -195,7 +196,7 @@ def _block_move(
     then = violated + jnp.einsum("asn,sn->a", whose, (after < 0) * 1.0 - (before < 0))
     prices_then, shares_then, least_then = priced(then)
     # the ratio of Metropolis and Hastings: heights, and the proposals' densities there and back, but for the prior's
-    gained = jnp.sum(_at(heights, then) - _at(heights, violated)) + jnp.sum(least_then - least)
+    gained = jnp.sum(at_violated(heights, then) - at_violated(heights, violated)) + jnp.sum(least_then - least)
     gained += jnp.sum(jnp.log(jnp.sum(shares, axis=1)) - jnp.log(jnp.sum(shares_then, axis=1)))
     gained += jnp.sum(prices * (after < 0)) - jnp.sum(prices_then * (before < 0))
     accepted = jnp.log(random.uniform(key_test, dtype=now.dtype)) < gained
@@ -251,12 +252,7 @@ def _drawn(key: PRNGKeyArray, intervals: _Intervals, shares: Float[Array, "s m"]
     return jnp.clip(jnp.where(low > 0, -quantile, quantile), low, high)
 
 
-def _at(heights: Float[Array, "a v"], violated: Float[Array, " a"]) -> Float[Array, " a"]:
-    """Each answerer's height at so many violated answers."""
-    return heights[jnp.arange(len(heights)), violated.astype(int)]
-
-
 def _price(heights: Float[Array, "a v"], violated: Float[Array, " a"]) -> Float[Array, " a"]:
     """By how much one violated answer more lowers the height, for each answerer: the mean of the last and the next."""
     fewer, more = jnp.maximum(violated - 1, 0), jnp.minimum(violated + 1, heights.shape[1] - 1)
-    return (_at(heights, fewer) - _at(heights, more)) / (more - fewer)
+    return (at_violated(heights, fewer) - at_violated(heights, more)) / (more - fewer)

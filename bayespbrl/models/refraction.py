@@ -102,6 +102,11 @@ def walls_of(
     return Walls(*map(jnp.asarray, (normals, products, relieved, margins.astype(int), places)))
 
 
+def at_violated(heights: Float[Array, "a n"], violated: Float[Array, " a"]) -> Float[Array, " a"]:
+    """Each answerer's height at so many violated answers."""
+    return heights[jnp.arange(len(heights)), violated.astype(int)]
+
+
 def flown(
     y: Float[Array, " q"],
     velocity: Float[Array, " q"],
@@ -122,7 +127,7 @@ def flown(
     """
     number, squares = len(walls.relieved), jnp.diagonal(walls.products)
     of = jnp.arange(number) if walls.margins is None else walls.margins
-    there, each = jnp.any(walls.relieved != 0, axis=1) & (squares[of] > 0), jnp.arange(len(heights))
+    there = jnp.any(walls.relieved != 0, axis=1) & (squares[of] > 0)
 
     def to_next_wall(now: _Flight) -> _Flight:
         cotangents = jnp.where(there, _cotangents(now, walls), -jnp.inf)
@@ -135,7 +140,7 @@ def flown(
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         speed = now.speeds[margin] * cos - now.margins[margin] * sin
         beyond = now.violated - jnp.sign(speed) * walls.relieved[wall]
-        gain = jnp.sum(heights[each, beyond.astype(int)] - heights[each, now.violated.astype(int)])
+        gain = jnp.sum(at_violated(heights, beyond) - at_violated(heights, now.violated))
         # Afshar & Domke (2015): through with the speed that is left, or reflected where none is
         square = speed**2 + 2 * squares[margin] * gain
         through = square > 0

@@ -25,7 +25,7 @@ from bayespbrl.models.gibbs import (
 )
 from bayespbrl.models.lapse_transport import Ladder, ladder_of, transported
 from bayespbrl.models.likelihoods import log_prob, ties_of
-from bayespbrl.models.refraction import Walls, flight_move, walls_of
+from bayespbrl.models.refraction import Walls, at_violated, flight_move, walls_of
 from bayespbrl.models.tempering import walked
 
 # Dimensions from which few answers decide about each, so that the lapse rate takes the weights along.
@@ -93,14 +93,19 @@ def steps_of(fits: Sequence[GaussianFit], problem: JointProblem) -> Steps:
 def step_moves(
     key: PRNGKeyArray, z: Float[Array, " q"], unknowns: Unknowns, problem: JointProblem, steps: Steps
 ) -> tuple[Float[Array, " q"], Unknowns, Bool[Array, ""]]:
-    """Sweeps and flights, lapse rates drawn after them and then with the weights.
+    """A tempered walk, sweeps and flights, lapse rates drawn after them and then with the weights.
 
     Returns:
       the weights, the unknowns, and whether a flight was given up.
     """
     y = z / problem.settings.prior_scale
     walls = at_setting(steps.walls, unknowns.setting)
-    now, total = _Walker(y, walls.normals @ y, unknowns.tie_threshold), partial(_total, problem, unknowns)
+    now = _Walker(y, walls.normals @ y, unknowns.tie_threshold)
+    if steps.tempered is not None:
+        key_tempered, key = random.split(key)
+        now = _tempered_move(key_tempered, now, unknowns, problem, steps)
+        unknowns = unknowns._replace(tie_threshold=now.threshold)
+    total = partial(_total, problem, unknowns)
 
     def flight(
         before: tuple[_Walker, Bool[Array, ""]], key: PRNGKeyArray
@@ -121,11 +126,6 @@ def step_moves(
             log_likelihood=total,
         )
         now = now._replace(y=y, margins=margins)
-    if steps.tempered is not None:
-        key_tempered, key = random.split(key)
-        now = _tempered_move(key_tempered, now, unknowns, problem, steps)
-        unknowns = unknowns._replace(tie_threshold=now.threshold)
-        total = partial(_total, problem, unknowns)
     keys, start = random.split(key, 3), (now, jnp.zeros((), bool))
     if steps.ladder is None or steps.sweep is not None:
         (now, given_up), _ = flight(start, keys[0])
@@ -157,7 +157,7 @@ def _flown(
         now.y,
         walls.at(threshold),
         margins=now.margins,
-        violated=problem.answerers @ _violated(problem, threshold, now.margins),
+        violated=_violated(problem, threshold, now.margins),
         heights=heights,
         log_likelihood=log_likelihood,
     )
@@ -209,8 +209,7 @@ def _height(
     problem: JointProblem, heights: Float[Array, "a n"], threshold: Float[Array, ""], margins: Float[Array, " c"]
 ) -> Float[Array, ""]:
     """The heights' sum over the answerers."""
-    violated = problem.answerers @ _violated(problem, threshold, margins)
-    return jnp.sum(heights[jnp.arange(len(violated)), violated.astype(int)])
+    return jnp.sum(at_violated(heights, _violated(problem, threshold, margins)))
 
 
 def _transport_move(
@@ -250,12 +249,12 @@ def _beside(problem: JointProblem, point: Point) -> Float[Array, "2 *b c"]:
     return jnp.exp(jnp.stack([log_prob(likelihood, jnp.full(shape, sign * BESIDE)) for sign in (1, -1)]))
 
 
-def _violated(problem: JointProblem, threshold: Float[Array, ""], margins: Float[Array, " c"]) -> Bool[Array, " c"]:
-    """Which answers their margins contradict."""
+def _violated(problem: JointProblem, threshold: Float[Array, ""], margins: Float[Array, " c"]) -> Float[Array, " a"]:
+    """How many answers of each answerer their margins contradict."""
     ties = ties_of(problem.settings.likelihood)
     if ties is None:
-        return margins < 0
-    return jnp.where(ties.indifferent, jnp.abs(margins) > threshold, margins < threshold)
+        return problem.answerers @ (margins < 0)
+    return problem.answerers @ jnp.where(ties.indifferent, jnp.abs(margins) > threshold, margins < threshold)
 
 
 def _heights(problem: JointProblem) -> Float[Array, "a n"]:

@@ -43,17 +43,21 @@ def walked(
         *,
         back: bool,
     ) -> tuple[tuple[State, Float[Array, ""]], None]:
-        (state, gained), (key, before, share) = now, step
-        gained += (share - before) * height(state)  # log p(x) with this share, less that with the one before
+        """To the flatter share and the moves there; or these, and from it."""
+        (state, gained), (key, share, flatter) = now, step
         each = list(zip(moves, random.split(key, len(moves)), strict=True))
+        # Neal (1996): log p(x) after a change of the share, less that before
+        if not back:
+            gained += (flatter - share) * height(state)
         for move, its in reversed(each) if back else each:
-            state = move(its, state, share)
+            state = move(its, state, flatter)
+        if back:
+            gained += (share - flatter) * height(state)
         return (state, gained), None
 
     key_forth, key_back = random.split(key)
     forth = random.split(key_forth, LEVELS), shares[:-1], shares[1:]
     now, _ = lax.scan(partial(level, back=False), (start, jnp.zeros(())), forth)
-    # Neal (1996): back through the same levels, the flattest twice
-    back = random.split(key_back, LEVELS), jnp.append(shares[-1], shares[:0:-1][:-1]), shares[:0:-1]
+    back = random.split(key_back, LEVELS), shares[-2::-1], shares[:0:-1]
     (end, gained), _ = lax.scan(partial(level, back=True), now, back)
-    return end, gained + (shares[0] - shares[1]) * height(end)
+    return end, gained
